@@ -1,0 +1,169 @@
+"""The Gymnasium environment: one task, one arm, any cameras."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_symview import keys
+from lerobot_symview.camera import Camera
+from lerobot_symview.placement import CameraSpec, top_camera
+from lerobot_symview.workspace import Workspace
+from symview_sim.motions import MAX_STEP, MAX_TURN
+from symview_sim.rendering import render
+from symview_sim.scene import Scene
+from symview_sim.tasks import make_task
+
+START_HEIGHT = 0.2
+GRIPPER_HEIGHTS = (0.02, 0.25)  # metres the gripper may reach; below 2 cm the fingers touch the table
+RENDER_SIZE = 256
+
+Observation = dict[str, Any]
+
+
+class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """A tabletop task seen by freely placed RGBD cameras.
+
+    Action: (5,) float32 dx, dy, dz (metres, clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in [0, 1].
+    Observation: `pixels[camera]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W) metres;
+    `camera.<camera>.intrinsics` (9,), `camera.<camera>.world_from_cam` (16,); `agent_pos` (5,) gripper x, y (metres,
+    relative to the workspace centre), z, yaw (radians), aperture.
+    Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` says so.
+    Start: gripper open, 20 cm above the workspace centre, objects at random.
+    End: success, an object out of reach, or `max_steps` actions.
+
+    Args:
+        task: a name from `symview_sim.TASK_NAMES`.
+        robot: a name in `symview_sim.robots.ROBOTS`.
+        cameras: where the cameras stand.
+        oracle: adds the camera `top`, which looks straight down and does not see the arm.
+        workspace: the working area.
+        start_jitter: largest displacement of the start position per axis, metres.
+        max_steps: actions per episode.
+        render_mode: `rgb_array` (or None); `render()` returns the first camera's view.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 3}  # noqa: RUF012  gymnasium's own form
+
+    def __init__(
+        self,
+        task: str,
+        robot: str = "panda",
+        cameras: tuple[CameraSpec, ...] = (CameraSpec(),),
+        oracle: bool = False,
+        workspace: Workspace | None = None,
+        start_jitter: float = 0.0,
+        max_steps: int = 50,
+        render_mode: str | None = "rgb_array",
+    ):
+        self.task = task
+        self._task = make_task(task)
+        self.task_description = self._task.instruction
+        self.workspace = workspace or Workspace()
+        self.render_mode = render_mode
+        self._max_episode_steps = max_steps
+        self._start_jitter = start_jitter
+        self._robot = robot
+        specs = (*cameras, top_camera(cameras[0].size, self.workspace)) if oracle else cameras
+        self.cameras = {spec.name: spec.place(self.workspace) for spec in specs}
+        self._sees_robot = {spec.name: spec.sees_robot for spec in specs}
+        self._scene: Scene | None = None
+        self._steps = 0
+        limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
+        self.action_space = gymnasium.spaces.Box(np.append(-limits, np.float32(0)), np.append(limits, np.float32(1)))
+        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras))
+
+    @property
+    def scene(self) -> Scene:
+        """The simulator, started when first needed so that an environment costs nothing until it is reset."""
+        if self._scene is None:
+            self._scene = Scene(self._robot, self.workspace)
+        return self._scene
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+        """Start an episode; everything random in it follows from `seed`."""
+        super().reset(seed=seed)
+        self._steps = 0
+        jitter = self.np_random.uniform(-self._start_jitter, self._start_jitter, size=3)
+        self.scene.reset(np.array([*self.workspace.center, START_HEIGHT]) + jitter, gripper_yaw=0.0)
+        self._task.spawn(self.scene, self.np_random)
+        self.scene.settle()
+        return self._observe(), {"is_success": False}
+
+    def step(self, action: NDArray[np.floating]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move the gripper by `action` (5,), clamped to the action space."""
+        arm = self.scene.arm
+        *motion, aperture = np.clip(
+            np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high
+        )
+        half = self.workspace.size / 2
+        low = (self.workspace.center[0] - half, self.workspace.center[1] - half, GRIPPER_HEIGHTS[0])
+        high = (self.workspace.center[0] + half, self.workspace.center[1] + half, GRIPPER_HEIGHTS[1])
+        arm.move(np.clip(arm.position + motion[:3], low, high), arm.yaw + motion[3], aperture)
+        self._steps += 1
+        success = bool(self._task.is_success(self.scene))
+        terminated = success or not self._task.is_valid(self.scene)
+        truncated = self._steps >= self._max_episode_steps and not terminated
+        return self._observe(), float(success), terminated, truncated, {"is_success": success}
+
+    def expert_action(self) -> NDArray[np.float32]:
+        """Return what the task's expert does in the present state, (5,) float32."""
+        return self._task.expert_action(self.scene).astype(np.float32)
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]  # gymnasium declares a union of every mode
+        """Return the first camera's view, uint8 (256, 256, 3)."""
+        camera = next(iter(self.cameras.values()))
+        scale = RENDER_SIZE / camera.height
+        intrinsics = camera.intrinsics * [[scale], [scale], [1]]
+        intrinsics[:2, 2] = (RENDER_SIZE - 1) / 2
+        return render(self.scene.client, Camera(intrinsics, camera.world_from_cam, RENDER_SIZE, RENDER_SIZE))[0]
+
+    def close(self) -> None:
+        """Shut the simulator down."""
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None
+
+    def _observe(self) -> Observation:
+        arm = self.scene.arm
+        position = arm.position - (*self.workspace.center, 0.0)
+        observation: Observation = {
+            "agent_pos": np.array([*position, arm.yaw, arm.aperture], dtype=np.float32),
+            "pixels": {},
+        }
+        for name, camera in self.cameras.items():
+            rgb, depth = self._render(name, camera)
+            observation["pixels"][name] = rgb
+            observation[_env_key(keys.depth(name))] = depth[None]
+            observation[_env_key(keys.intrinsics(name))] = camera.intrinsics.ravel().astype(np.float32)
+            observation[_env_key(keys.world_from_cam(name))] = camera.world_from_cam.ravel().astype(np.float32)
+        return observation
+
+    def _render(self, name: str, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        if self._sees_robot[name]:
+            return render(self.scene.client, camera)
+        with self.scene.arm.hidden():
+            return render(self.scene.client, camera)
+
+
+def _env_key(key: str) -> str:
+    """Observation key that LeRobot turns into `key`, which it does by prefixing `observation.`."""
+    return key.removeprefix("observation.")
+
+
+def _observation_spaces(cameras: dict[str, Camera]) -> dict[str, gymnasium.Space[Any]]:
+    box = gymnasium.spaces.Box
+    spaces: dict[str, gymnasium.Space[Any]] = {
+        "agent_pos": box(-np.inf, np.inf, (len(keys.STATE_NAMES),), np.float32),
+        "pixels": gymnasium.spaces.Dict(
+            {name: box(0, 255, (camera.height, camera.width, 3), np.uint8) for name, camera in cameras.items()}
+        ),
+    }
+    for name, camera in cameras.items():
+        spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, camera.height, camera.width), np.float32)
+        spaces[_env_key(keys.intrinsics(name))] = box(-np.inf, np.inf, (9,), np.float32)
+        spaces[_env_key(keys.world_from_cam(name))] = box(-np.inf, np.inf, (16,), np.float32)
+    return spaces

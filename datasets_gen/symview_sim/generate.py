@@ -1,0 +1,169 @@
+"""`symview-generate`: expert demonstrations of a task as a LeRobot dataset."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_symview import keys
+from lerobot_symview.cli import CommandError, DatasetTarget, run_command
+from lerobot_symview.features import Features, camera_features
+from lerobot_symview.names import lookup
+from lerobot_symview.placement import CameraSpec
+from lerobot_symview.staging import staged
+from symview_sim.tasks import TASK_NAMES
+
+EXAMPLES = """\
+  symview-generate --dataset.repo_id=me/picking --task=block_picking --episodes=50
+  symview-generate --dataset.repo_id=me/low --dataset.root=data/low --camera.elevation=20 --oracle=false"""
+
+# lerobot-eval seeds its episodes from 1000 upwards: demonstrations are drawn from elsewhere.
+FIRST_SEED = 1_000_000
+MAX_FAILURE_RATE = 0.2
+
+Episode = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """Let a task's expert demonstrate it and record what the cameras see."""
+
+    dataset: DatasetTarget
+    """Where the dataset goes."""
+    task: str = "block_picking"
+    """Which task."""
+    episodes: int = 50
+    """How many successful demonstrations."""
+    seed: int = 0
+    """Chooses the scenes: episode i starts from seed 1,000,000 (seed + 1) + i."""
+    robot: str = "panda"
+    """Which arm."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """Where the camera stands."""
+    oracle: bool = True
+    """Also record `top`, which looks straight down and does not see the arm."""
+    start_jitter: float = 0.0
+    """Largest random displacement of the gripper's start position per axis, metres."""
+
+    def __post_init__(self) -> None:
+        lookup("--task", self.task, dict.fromkeys(TASK_NAMES))
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must not be negative, got {self.seed}")
+
+
+def generate(config: GenerateConfig) -> Path:
+    """Write the dataset that `config` describes and return its folder."""
+    target = config.dataset.folder()
+    with staged(target, "--dataset.root") as partial:
+        from lerobot.datasets import LeRobotDataset
+
+        from symview_sim.env import SymviewEnv
+
+        env = SymviewEnv(
+            config.task,
+            robot=config.robot,
+            cameras=(config.camera,),
+            oracle=config.oracle,
+            start_jitter=config.start_jitter,
+        )
+        dataset = LeRobotDataset.create(
+            config.dataset.repo_id,
+            fps=SymviewEnv.metadata["render_fps"],
+            features=_features(env, config),
+            root=partial,
+            robot_type=config.robot,
+            use_videos=False,
+        )
+        steps = 0
+        for episode in tqdm(demonstrations(env, config), desc=config.task, total=config.episodes, unit="episode"):
+            for frame in episode:
+                dataset.add_frame(frame | {"task": env.task_description})
+            dataset.save_episode()
+            steps += len(episode)
+        dataset.finalize()
+        env.close()
+    logging.info("wrote %d demonstrations, %d frames, to %s", config.episodes, steps, target)
+    return target
+
+
+def demonstrations(env: Any, config: GenerateConfig) -> Iterator[Episode]:
+    """Yield `config.episodes` successful episodes, each a list of dataset frames; failed ones are left out.
+
+    Raises:
+        CommandError: when more than a fifth of the episodes fail, which an expert's never do.
+    """
+    recorded, failed = 0, 0
+    while recorded < config.episodes:
+        episode = _demonstrate(env, FIRST_SEED * (config.seed + 1) + recorded + failed)
+        if episode is not None:
+            recorded += 1
+            yield episode
+            continue
+        failed += 1
+        if failed > 5 and failed > MAX_FAILURE_RATE * (recorded + failed):
+            raise CommandError(f"the expert failed {failed} of {recorded + failed} episodes: check --start_jitter")
+
+
+def _demonstrate(env: Any, seed: int) -> Episode | None:
+    observation, _ = env.reset(seed=seed)
+    frames: Episode = []
+    done = False
+    while not done:
+        action = env.expert_action()
+        before = observation
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        frames.append(
+            _frame(before, env.cameras)
+            | {
+                keys.ACTION: action,
+                "next.reward": np.array([reward], dtype=np.float32),
+                "next.done": np.array([done]),
+                "next.success": np.array([info["is_success"]]),
+            }
+        )
+    return frames if info["is_success"] else None
+
+
+def _frame(observation: dict[str, Any], cameras: dict[str, Any]) -> dict[str, Any]:
+    frame = {keys.STATE: observation["agent_pos"]}
+    for name in cameras:
+        frame[keys.rgb(name)] = observation["pixels"][name]
+        frame[keys.depth(name)] = observation[keys.depth(name).removeprefix("observation.")].transpose(1, 2, 0)
+        for key in (keys.intrinsics(name), keys.world_from_cam(name)):
+            frame[key] = observation[key.removeprefix("observation.")]
+    return frame
+
+
+def _features(env: Any, config: GenerateConfig) -> Features:
+    facts = {
+        "workspace": asdict(env.workspace),
+        "task": config.task,
+        "seed": config.seed,
+        "placement": asdict(config.camera),
+        "pybullet": version("pybullet"),
+    }
+    features: Features = {
+        keys.STATE: {"dtype": "float32", "shape": (len(keys.STATE_NAMES),), "names": keys.STATE_NAMES},
+        keys.ACTION: {"dtype": "float32", "shape": (len(keys.ACTION_NAMES),), "names": keys.ACTION_NAMES},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+    for name, camera in env.cameras.items():
+        features |= camera_features(name, camera.height, camera.width, facts)
+    return features
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(GenerateConfig, generate, EXAMPLES)

@@ -1,0 +1,165 @@
+"""Pinhole cameras: intrinsics, poses, projection and its inverse.
+
+Axes are OpenCV's (x right, y down, z forward), integer pixel coordinates are pixel centres, lengths are metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+class CalibrationError(ValueError):
+    """A camera's intrinsics or pose cannot describe a real pinhole camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated pinhole camera.
+
+    Args:
+        intrinsics: (3, 3) float64, the matrix K in pixels, no skew.
+        world_from_cam: (4, 4) float64, rigid, maps camera coordinates to world coordinates, metres.
+        height: image rows.
+        width: image columns.
+
+    Raises:
+        CalibrationError: all that is wrong with the matrices, in one message.
+    """
+
+    intrinsics: Array
+    world_from_cam: Array
+    height: int
+    width: int
+
+    def __post_init__(self) -> None:
+        intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
+        world_from_cam = np.asarray(self.world_from_cam, dtype=np.float64)
+        problems = calibration_problems(intrinsics, world_from_cam, self.height, self.width)
+        if problems:
+            raise CalibrationError("invalid camera: " + "; ".join(problems))
+        object.__setattr__(self, "intrinsics", intrinsics)
+        object.__setattr__(self, "world_from_cam", world_from_cam)
+
+    @property
+    def position(self) -> Array:
+        """(3,) the optical centre in the world."""
+        return self.world_from_cam[:3, 3]
+
+    @property
+    def cam_from_world(self) -> Array:
+        """(4, 4) inverse of `world_from_cam`."""
+        return invert_rigid(self.world_from_cam)
+
+
+def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:
+    """List every reason why the matrices are not a pinhole camera's; empty when they are."""
+    if intrinsics.shape != (3, 3):
+        return [f"intrinsics must have shape (3, 3), got {intrinsics.shape}"]
+    if world_from_cam.shape != (4, 4):
+        return [f"world_from_cam must have shape (4, 4), got {world_from_cam.shape}"]
+    if not (np.isfinite(intrinsics).all() and np.isfinite(world_from_cam).all()):
+        return ["matrices must be finite"]
+    problems = []
+    (fx, skew, cx), (row_1, fy, cy), last = intrinsics
+    if fx <= 0 or fy <= 0:
+        problems.append(f"focal lengths must be positive, got fx={fx:g}, fy={fy:g}")
+    if skew != 0 or row_1 != 0 or not np.array_equal(last, [0, 0, 1]):
+        problems.append("intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    if not (0 <= cx <= width - 1 and 0 <= cy <= height - 1):
+        problems.append(f"principal point ({cx:g}, {cy:g}) lies outside the {width} x {height} image")
+    rotation = world_from_cam[:3, :3]
+    deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if deviation > 1e-4:
+        problems.append(f"rotation is not orthonormal (largest deviation {deviation:.2g})")
+    elif np.linalg.det(rotation) < 0:
+        problems.append("rotation is a reflection (determinant -1): the axes are left-handed")
+    if not np.allclose(world_from_cam[3], [0, 0, 0, 1], atol=1e-6):
+        problems.append(f"last row of world_from_cam must be 0 0 0 1, got {world_from_cam[3]}")
+    return problems
+
+
+def intrinsics_from_fov(fov: float, height: int, width: int) -> Array:
+    """Return K (3, 3) of a centred pinhole whose vertical field of view is `fov` radians.
+
+    The image spans pixel edges -0.5 to height - 0.5, so the principal point is ((width - 1)/2, (height - 1)/2).
+    """
+    if not 0 < fov < np.pi:
+        raise CalibrationError(f"field of view must lie in (0, pi) radians, got {fov:g}")
+    focal = height / 2 / np.tan(fov / 2)
+    return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+
+
+def orbit_pose(elevation: float, azimuth: float, distance: float, target: ArrayLike) -> Array:
+    """Return world_from_cam (4, 4) of a camera that looks at `target` from a sphere around it, image top upwards.
+
+    Args:
+        elevation: radians above the horizontal plane; pi/2 looks straight down.
+        azimuth: radians about world z; 0 stands on the +x side of the target, pi/2 on the +y side.
+        distance: metres, positive.
+        target: (3,) world point, metres.
+
+    The axes are written out rather than built from an up vector, so straight down is not a special case: at
+    elevation pi/2 and azimuth 0 rows grow with +x and columns with +y.
+    """
+    if distance <= 0:
+        raise CalibrationError(f"camera distance must be positive, got {distance:g} m")
+    (se, ce), (sa, ca) = (np.sin(elevation), np.cos(elevation)), (np.sin(azimuth), np.cos(azimuth))
+    backward = np.array([ce * ca, ce * sa, se])
+    right = np.array([-sa, ca, 0.0])
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, 0] = right
+    world_from_cam[:3, 1] = np.cross(-backward, right)
+    world_from_cam[:3, 2] = -backward
+    world_from_cam[:3, 3] = np.asarray(target, dtype=np.float64) + distance * backward
+    return world_from_cam
+
+
+def invert_rigid(a_from_b: Array) -> Array:
+    """Return b_from_a (4, 4) for a rigid a_from_b (4, 4)."""
+    b_from_a = np.eye(4)
+    b_from_a[:3, :3] = a_from_b[:3, :3].T
+    b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
+    return b_from_a
+
+
+def transform(a_from_b: Array, points_b: Array) -> Array:
+    """Map points (..., 3) from frame b to frame a with a rigid (4, 4)."""
+    return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
+def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
+    """Lift a depth image to world points (paper Eq. 2-4).
+
+    Args:
+        depth: (H, W) float, metres along the optical axis.
+        camera: its calibration.
+
+    Returns:
+        (H, W, 3) float64, world coordinates in metres; meaningless where `depth` is.
+    """
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
+    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
+    cx, cy = camera.intrinsics[:2, 2]
+    x_over_z = (np.arange(camera.width) - cx) / fx
+    y_over_z = (np.arange(camera.height) - cy) / fy
+    z = depth.astype(np.float64)
+    points_cam = np.stack([z * x_over_z, z * y_over_z[:, None], z], axis=-1)
+    return transform(camera.world_from_cam, points_cam)
+
+
+def project(points_world: Array, camera: Camera) -> tuple[Array, Array]:
+    """Project world points (..., 3) to pixels (..., 2) as (u, v), and their depth (...) in metres.
+
+    Points with depth <= 0 lie behind the camera; their pixels are not meaningful.
+    """
+    points_cam = transform(camera.cam_from_world, np.asarray(points_world, dtype=np.float64))
+    depth = points_cam[..., 2]
+    homogeneous = points_cam @ camera.intrinsics.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return homogeneous[..., :2] / depth[..., None], depth

@@ -1,0 +1,81 @@
+"""What every console command shares: flags from a dataclass, one-line errors, exit codes."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+USAGE, FAILURE = 2, 1
+
+
+class CommandError(Exception):
+    """A failure that the user can mend; its message says how. The command ends with exit code 1 and no traceback."""
+
+
+@dataclass(frozen=True)
+class DatasetTarget:
+    """Where a dataset is.
+
+    Args:
+        repo_id: `user/name`, its name on the Hub.
+        root: folder; by default LeRobot's own cache folder for `repo_id`.
+    """
+
+    repo_id: str
+    root: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.repo_id.count("/") != 1 or not all(self.repo_id.split("/")):
+            raise ValueError(f"--dataset.repo_id must look like user/name, got {self.repo_id!r}")
+
+    def folder(self) -> Path:
+        """Return the folder, resolved."""
+        if self.root is not None:
+            return Path(self.root).expanduser().resolve()
+        from lerobot.utils.constants import HF_LEROBOT_HOME
+
+        return Path(HF_LEROBOT_HOME) / self.repo_id
+
+
+def run_command[Config](config_class: type[Config], main: Callable[[Config], object], examples: str) -> None:
+    """Parse the command line into `config_class`, run `main`, and end the process.
+
+    Exit codes: 0 done, 2 a flag is wrong, 1 anything else; a user's mistake is one line on stderr.
+    """
+    import draccus
+
+    program = Path(sys.argv[0]).name
+    if "--version" in sys.argv[1:]:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"{program} {version('lerobot_policy_symview')}\n")
+        sys.exit(0)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    logging.getLogger("httpx").setLevel(logging.WARNING)
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        sys.stdout.write(f"{config_class.__doc__ or ''}\n\nexamples:\n{examples}\n\n")
+    try:
+        config = draccus.parse(config_class)
+    except Exception as error:  # draccus raises what a field's type raises: each is a wrong flag
+        _end(program, error, USAGE)
+    try:
+        main(config)
+    except (CommandError, OSError) as error:
+        _end(program, error, FAILURE)
+    except ValueError as error:
+        _end(program, error, USAGE)
+    except KeyboardInterrupt:
+        _end(program, CommandError("interrupted"), 130)
+    sys.exit(0)
+
+
+def _end(program: str, error: Exception, code: int) -> Any:
+    cause: BaseException = error
+    while cause.__cause__ is not None and code == USAGE:  # draccus wraps the message that names the value
+        cause = cause.__cause__
+    sys.stderr.write(f"{program}: error: {' '.join(str(cause).split())}\n")
+    sys.exit(code)

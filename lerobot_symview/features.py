@@ -1,0 +1,52 @@
+"""LeRobot feature declarations of what cameras and views yield."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from lerobot_symview import keys
+from lerobot_symview.views import View
+from lerobot_symview.workspace import Workspace
+
+Features = dict[str, dict[str, Any]]
+IMAGE_AXES = ["height", "width", "channels"]
+
+
+def color_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
+    """Declare an RGB image; `facts` are stored with it under `info["symview"]`."""
+    return {"dtype": "image", "shape": (height, width, 3), "names": IMAGE_AXES, "info": {"symview": facts}}
+
+
+def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
+    """Declare a float32 image in metres, stored losslessly."""
+    info = {"is_depth_map": True, "depth_unit": "m", "symview": facts}
+    return {"dtype": "image", "shape": (height, width, 1), "names": IMAGE_AXES, "info": info}
+
+
+def camera_features(name: str, height: int, width: int, facts: dict[str, Any]) -> Features:
+    """Declare colour, depth and calibration of one RGBD camera."""
+    return {
+        keys.rgb(name): color_feature(height, width, facts),
+        keys.depth(name): metric_feature(height, width, facts),
+        keys.intrinsics(name): {"dtype": "float32", "shape": (9,), "names": [f"k{i}{j}" for i in range(3) for j in range(3)]},
+        keys.world_from_cam(name): {"dtype": "float32", "shape": (16,), "names": [f"t{i}{j}" for i in range(4) for j in range(4)]},
+    }
+
+
+def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:
+    """Declare the outputs of `view`, with everything needed to compute them again."""
+    facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}  # type: ignore[call-overload]
+    declare = {"rgb": color_feature, "height": metric_feature}
+    return {
+        keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()
+    }
+
+
+def stored_workspace(features: Features) -> Workspace:
+    """Return the workspace a dataset was recorded in; the default one where it does not say."""
+    for feature in features.values():
+        facts = (feature.get("info") or {}).get("symview", {})
+        if "workspace" in facts:
+            return Workspace(**(facts["workspace"] | {"center": tuple(facts["workspace"]["center"])}))
+    return Workspace()

@@ -1,0 +1,52 @@
+"""RGB perspective: a plane parallel to the table warped into an image from above (paper section 4.2)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_symview.camera import Array, Camera, CalibrationError
+from lerobot_symview.workspace import Workspace
+
+
+def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> Array:
+    """Return the homography (3, 3) from top-down pixels (column, row, 1) to camera pixels (u, v, 1), up to scale.
+
+    The plane lies `plane_height` metres above the table. y = K(Rx + t) restricted to that plane is itself a
+    homography, so nothing is solved for: the four workspace corners go to the four image corners by construction.
+
+    Raises:
+        CalibrationError: if a corner of the plane lies behind the camera, or the camera lies in the plane.
+    """
+    cam_from_world = camera.cam_from_world
+    if (cam_from_world[2, :3] @ workspace.corners(plane_height).T + cam_from_world[2, 3] <= 0).any():
+        raise CalibrationError(f"the workspace at height {plane_height:g} m lies partly behind the camera")
+    if abs(camera.position[2] - plane_height) < 1e-6:
+        raise CalibrationError(f"the camera lies in the plane at height {plane_height:g} m and sees it edge-on")
+    resolution = workspace.size / pixels
+    world_from_topdown = np.array(
+        [
+            [0, resolution, workspace.center[0] + (0.5 / pixels - 0.5) * workspace.size],
+            [resolution, 0, workspace.center[1] + (0.5 / pixels - 0.5) * workspace.size],
+            [0, 0, plane_height],
+            [0, 0, 1],
+        ]
+    )
+    return camera.intrinsics @ cam_from_world[:3] @ world_from_topdown
+
+
+def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: Array, pixels: int) -> NDArray[np.uint8]:
+    """Sample `rgb` (H, W, 3) through a homography into (pixels, pixels, 3), bilinear, black outside the image."""
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(rgb, image_from_topdown, (pixels, pixels), flags=flags), dtype=np.uint8)
+
+
+def camera_direction(camera: Camera, workspace: Workspace) -> Array:
+    """Return the horizontal unit vector (2,) from the workspace centre to the camera; zero straight above it.
+
+    It transforms as irrep(1, 1) and tells an equivariant network from where it is looking (paper section 4.2).
+    """
+    offset = camera.position[:2] - np.asarray(workspace.center)
+    length = np.linalg.norm(offset)
+    return offset / length if length > 1e-9 else np.zeros(2)

@@ -1,0 +1,11 @@
+"""LeRobot plugin: views, policies and simulated tasks of symview.
+
+LeRobot imports this package by the name of its distribution. Importing it registers the policy and environment
+configurations and the processor steps; networks and the simulator are imported when one is built.
+"""
+
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.env_symview import SymviewEnvConfig
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
+
+__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "ViewsProcessorStep"]
