@@ -23,6 +23,8 @@ from lerobot_symview.workspace import Workspace
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+logger = logging.getLogger(__name__)
+
 EXAMPLES = """\
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/picking_views --views='[reproj, persp]'
   symview-add-views --dataset.repo_id=me/picking --dataset.root=data/picking \\
@@ -86,7 +88,7 @@ def add_views(config: AddViewsConfig) -> Path:
         images = _render(source, config.camera, views, workspace)
         _write(source, partial, config, added, images)
         _write_stats(partial, added, images)
-    logging.info("wrote %d frames with %s to %s", len(images), ", ".join(views), target)
+    logger.info("wrote %d frames with %s to %s", len(images), ", ".join(views), target)
     return target
 
 
@@ -99,7 +101,9 @@ def _check_inputs(config: AddViewsConfig, features: Features, views: dict[str, V
     if missing:
         cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
         raise ValueError(f"the dataset lacks {missing}; --camera={camera}, calibrated cameras: {cameras or 'none'}")
-    existing = [key for name, view in views.items() for key in (keys.view(camera, o) for o in view.outputs) if key in features]
+    existing = [
+        key for name, view in views.items() for key in (keys.view(camera, o) for o in view.outputs) if key in features
+    ]
     if existing:
         raise ValueError(f"the dataset has {existing} already: take them out of --views")
     unknown = [name for name in config.keep or [] if keys.rgb(name) not in features]
@@ -142,7 +146,11 @@ def _write(
     dropped = []
     if config.keep is not None:
         kept = {keys.rgb(name) for name in config.keep}
-        dropped = [key for key, feature in source.meta.features.items() if feature["dtype"] in ("image", "video") and key not in kept]
+        dropped = [
+            key
+            for key, feature in source.meta.features.items()
+            if feature["dtype"] in ("image", "video") and key not in kept
+        ]
 
     def value_of(key: str) -> Any:
         return lambda row, episode, frame: images[int(row["index"])][key]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 USAGE, FAILURE = 2, 1
+PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval")
 
 
 class CommandError(Exception):
@@ -18,15 +21,12 @@ class CommandError(Exception):
 
 @dataclass(frozen=True)
 class DatasetTarget:
-    """Where a dataset is.
-
-    Args:
-        repo_id: `user/name`, its name on the Hub.
-        root: folder; by default LeRobot's own cache folder for `repo_id`.
-    """
+    """Where a dataset is."""
 
     repo_id: str
+    """`user/name`, its name on the Hub."""
     root: Path | None = None
+    """Folder; by default LeRobot's own cache folder for `repo_id`."""
 
     def __post_init__(self) -> None:
         if self.repo_id.count("/") != 1 or not all(self.repo_id.split("/")):
@@ -54,8 +54,7 @@ def run_command[Config](config_class: type[Config], main: Callable[[Config], obj
 
         sys.stdout.write(f"{program} {version('lerobot_policy_symview')}\n")
         sys.exit(0)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    logging.getLogger("httpx").setLevel(logging.WARNING)
+    _quiet()
     if {"-h", "--help"} & set(sys.argv[1:]):
         sys.stdout.write(f"{config_class.__doc__ or ''}\n\nexamples:\n{examples}\n\n")
     try:
@@ -71,6 +70,17 @@ def run_command[Config](config_class: type[Config], main: Callable[[Config], obj
     except KeyboardInterrupt:
         _end(program, CommandError("interrupted"), 130)
     sys.exit(0)
+
+
+def _quiet() -> None:
+    """Show our messages and other libraries' errors: their warnings and inner progress bars say nothing to act upon."""
+    warnings.simplefilter("ignore")
+    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logging.basicConfig(level=logging.ERROR, handlers=[handler])
+    for package in PACKAGES:
+        logging.getLogger(package).setLevel(logging.INFO)
 
 
 def _end(program: str, error: Exception, code: int) -> Any:

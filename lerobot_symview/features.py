@@ -29,8 +29,16 @@ def camera_features(name: str, height: int, width: int, facts: dict[str, Any]) -
     return {
         keys.rgb(name): color_feature(height, width, facts),
         keys.depth(name): metric_feature(height, width, facts),
-        keys.intrinsics(name): {"dtype": "float32", "shape": (9,), "names": [f"k{i}{j}" for i in range(3) for j in range(3)]},
-        keys.world_from_cam(name): {"dtype": "float32", "shape": (16,), "names": [f"t{i}{j}" for i in range(4) for j in range(4)]},
+        keys.intrinsics(name): {
+            "dtype": "float32",
+            "shape": (9,),
+            "names": [f"k{i}{j}" for i in range(3) for j in range(3)],
+        },
+        keys.world_from_cam(name): {
+            "dtype": "float32",
+            "shape": (16,),
+            "names": [f"t{i}{j}" for i in range(4) for j in range(4)],
+        },
     }
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.camera import Array, Camera, CalibrationError
+from lerobot_symview.camera import Array, CalibrationError, Camera
 from lerobot_symview.workspace import Workspace
 
 

@@ -14,25 +14,22 @@ TOP_DISTANCE = 8.0  # metres: from so far above, perspective shifts a 5 cm block
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A camera that looks at the centre of the workspace.
-
-    Args:
-        name: prefix of its keys, such as `side`.
-        size: rows and columns, pixels.
-        fov: vertical field of view, degrees.
-        elevation: degrees above the table.
-        azimuth: degrees about the vertical; 0 faces the robot.
-        distance: metres from the centre of the workspace.
-        sees_robot: whether the arm is drawn; False gives an oracle.
-    """
+    """A camera that looks at the centre of the workspace."""
 
     name: str = "side"
+    """Prefix of its keys, such as `side`."""
     size: int = 152
+    """Rows and columns, pixels."""
     fov: float = 48.0
+    """Vertical field of view, degrees."""
     elevation: float = 45.0
+    """Degrees above the table."""
     azimuth: float = 0.0
+    """Degrees about the vertical; 0 faces the robot."""
     distance: float = 0.81
+    """Metres from the centre of the workspace."""
     sees_robot: bool = True
+    """Whether the arm is drawn; False gives an oracle."""
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():

@@ -73,7 +73,8 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._scene: Scene | None = None
         self._steps = 0
         limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
-        self.action_space = gymnasium.spaces.Box(np.append(-limits, np.float32(0)), np.append(limits, np.float32(1)))
+        self._action_low, self._action_high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
+        self.action_space = gymnasium.spaces.Box(self._action_low, self._action_high)
         self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras))
 
     @property
@@ -96,9 +97,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(self, action: NDArray[np.floating]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Move the gripper by `action` (5,), clamped to the action space."""
         arm = self.scene.arm
-        *motion, aperture = np.clip(
-            np.asarray(action, dtype=np.float64), self.action_space.low, self.action_space.high
-        )
+        *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
         half = self.workspace.size / 2
         low = (self.workspace.center[0] - half, self.workspace.center[1] - half, GRIPPER_HEIGHTS[0])
         high = (self.workspace.center[0] + half, self.workspace.center[1] + half, GRIPPER_HEIGHTS[1])
@@ -113,7 +112,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return what the task's expert does in the present state, (5,) float32."""
         return self._task.expert_action(self.scene).astype(np.float32)
 
-    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]  # gymnasium declares a union of every mode
+    def render(self) -> NDArray[np.uint8]:
         """Return the first camera's view, uint8 (256, 256, 3)."""
         camera = next(iter(self.cameras.values()))
         scale = RENDER_SIZE / camera.height

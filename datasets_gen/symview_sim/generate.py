@@ -20,6 +20,8 @@ from lerobot_symview.placement import CameraSpec
 from lerobot_symview.staging import staged
 from symview_sim.tasks import TASK_NAMES
 
+logger = logging.getLogger(__name__)
+
 EXAMPLES = """\
   symview-generate --dataset.repo_id=me/picking --task=block_picking --episodes=50
   symview-generate --dataset.repo_id=me/low --dataset.root=data/low --camera.elevation=20 --oracle=false"""
@@ -51,6 +53,10 @@ class GenerateConfig:
     """Also record `top`, which looks straight down and does not see the arm."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
+    noise: float = 0.0
+    """Standard deviation of a disturbance of every motion, as a fraction of the largest motion (0.2: 1 cm and 9 degrees).
+    The expert's own action is what is recorded, so that the dataset shows how to recover from small errors.
+    """
 
     def __post_init__(self) -> None:
         lookup("--task", self.task, dict.fromkeys(TASK_NAMES))
@@ -58,6 +64,8 @@ class GenerateConfig:
             raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
         if self.seed < 0:
             raise ValueError(f"--seed must not be negative, got {self.seed}")
+        if not 0 <= self.noise <= 1:
+            raise ValueError(f"--noise must lie in [0, 1], got {self.noise}")
 
 
 def generate(config: GenerateConfig) -> Path:
@@ -91,7 +99,7 @@ def generate(config: GenerateConfig) -> Path:
             steps += len(episode)
         dataset.finalize()
         env.close()
-    logging.info("wrote %d demonstrations, %d frames, to %s", config.episodes, steps, target)
+    logger.info("wrote %d demonstrations, %d frames, to %s", config.episodes, steps, target)
     return target
 
 
@@ -103,24 +111,27 @@ def demonstrations(env: Any, config: GenerateConfig) -> Iterator[Episode]:
     """
     recorded, failed = 0, 0
     while recorded < config.episodes:
-        episode = _demonstrate(env, FIRST_SEED * (config.seed + 1) + recorded + failed)
+        episode = _demonstrate(env, FIRST_SEED * (config.seed + 1) + recorded + failed, config.noise)
         if episode is not None:
             recorded += 1
             yield episode
             continue
         failed += 1
         if failed > 5 and failed > MAX_FAILURE_RATE * (recorded + failed):
-            raise CommandError(f"the expert failed {failed} of {recorded + failed} episodes: check --start_jitter")
+            raise CommandError(f"the expert failed {failed} of {recorded + failed} episodes: lower --noise or --start_jitter")
 
 
-def _demonstrate(env: Any, seed: int) -> Episode | None:
+def _demonstrate(env: Any, seed: int, noise: float) -> Episode | None:
     observation, _ = env.reset(seed=seed)
+    disturbances = np.random.default_rng(seed)
+    largest = np.append(env.action_space.high[:4], 0.0)  # the aperture is left alone
     frames: Episode = []
     done = False
     while not done:
         action = env.expert_action()
         before = observation
-        observation, reward, terminated, truncated, info = env.step(action)
+        disturbance = noise * largest * disturbances.standard_normal(len(action))
+        observation, reward, terminated, truncated, info = env.step(action + disturbance)
         done = terminated or truncated
         frames.append(
             _frame(before, env.cameras)
@@ -149,6 +160,7 @@ def _features(env: Any, config: GenerateConfig) -> Features:
         "workspace": asdict(env.workspace),
         "task": config.task,
         "seed": config.seed,
+        "noise": config.noise,
         "placement": asdict(config.camera),
         "pybullet": version("pybullet"),
     }

@@ -6,10 +6,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import NDArray
 
 from lerobot_symview.camera import Array, Camera, invert_rigid
+from symview_sim.bullet import pybullet
 
 NEAR, FAR = 0.05, 4.0  # metres, clipping planes
 TILE = 0.1  # metres, side of the table's squares

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pybullet
 from numpy.typing import ArrayLike
 
 from lerobot_symview.camera import Array
+from symview_sim.bullet import pybullet
 
 ARM_STEPS, GRIPPER_STEPS = 60, 25  # simulation steps at 1/240 s: 0.35 s an action
 POSITION_GAIN = 0.1
@@ -69,9 +69,7 @@ class Arm:
         self._client = client
         self._spec = spec
         # The collision meshes are drawn in place of the visual ones: 3.5k triangles for 100k, nine tenths of the time.
-        self.body = client.loadURDF(
-            spec.urdf, spec.base, useFixedBase=True, flags=pybullet.URDF_IGNORE_VISUAL_SHAPES
-        )
+        self.body = client.loadURDF(spec.urdf, spec.base, useFixedBase=True, flags=pybullet.URDF_IGNORE_VISUAL_SHAPES)
         self._joints = list(range(len(spec.home)))
         for finger in spec.finger_links:
             client.changeDynamics(

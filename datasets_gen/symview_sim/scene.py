@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pybullet
 import pybullet_data
-from pybullet_utils.bullet_client import BulletClient
 
 from lerobot_symview.camera import Array
 from lerobot_symview.names import lookup
 from lerobot_symview.workspace import Workspace
+from symview_sim.bullet import connect, pybullet
 from symview_sim.robots import ROBOTS, Arm
 
 GRAVITY = -9.81
@@ -27,7 +26,7 @@ class Scene:
     """
 
     def __init__(self, robot: str, workspace: Workspace):
-        self.client: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self.client: Any = connect()
         self.client.setAdditionalSearchPath(pybullet_data.getDataPath())
         self.workspace = workspace
         self._robot = lookup("robot", robot, ROBOTS)

@@ -33,4 +33,6 @@ def random_crop(images: Tensor, size: int) -> Tensor:
     rows = torch.randint(height - size + 1, (batch, 1), device=device) + torch.arange(size, device=device)
     columns = torch.randint(width - size + 1, (batch, 1), device=device) + torch.arange(size, device=device)
     index = torch.arange(batch, device=device)[:, None, None, None]
-    return images[index, torch.arange(channels, device=device)[:, None, None], rows[:, None, :, None], columns[:, None, None]]
+    return images[
+        index, torch.arange(channels, device=device)[:, None, None], rows[:, None, :, None], columns[:, None, None]
+    ]

@@ -24,43 +24,42 @@ CROP_SIZES = (64, 128)
 @PreTrainedConfig.register_subclass("symview_bc")
 @dataclass
 class SymviewBcConfig(PreTrainedConfig):
-    """Behaviour cloning from views of a freely placed camera. The defaults are the paper's.
-
-    Args:
-        view: what the network sees: `reproj` or `persp` (made from `camera`, read from the dataset where it has them),
-            `side` (the camera's own image), `top` (the oracle).
-        camera: camera that views are made from.
-        modality: `rgbd` adds the view's height (or a camera's depth) to its colour, `rgb` does not.
-        encoder: `equivariant` (D4) or `plain`.
-        width: regular fields n of the network; 64 gives the paper's 1.1 M parameters.
-        crop_size: pixels the network sees; a random crop in training, the middle in evaluation.
-        gripper_input: `image` draws the gripper into the view as a channel and adds its height; `none` leaves the paper's
-            channels, colour, height and aperture.
-        theta_representation: `sign`: yaw increments change sign in a mirror; `trivial`: the paper's text.
-        rotation_augmentation: turn each training sample by a random angle, action included.
-        learning_rate: of Adam.
-        learning_rate_decay: `cosine` lowers the rate to zero over the training, `none` keeps it, as in the paper.
-        state_symmetry: kind of each entry of `observation.state`, see `lerobot_policy_symview.symmetry`.
-        action_symmetry: kind of each entry of `action`.
-        view_options: options of the view; filled in from the dataset where that has the view.
-        workspace: constructor arguments of `Workspace`; filled in from the dataset.
-    """
+    """Behaviour cloning from views of a freely placed camera. The defaults are the paper's."""
 
     view: str = "reproj"
+    """What the network sees: `reproj` or `persp` (made from `camera`, read from the dataset where it has them), `side`
+    (the camera's own image), `top` (the oracle).
+    """
     camera: str = "side"
+    """Camera that views are made from."""
     modality: Literal["rgb", "rgbd"] = "rgbd"
+    """`rgbd` adds the view's height (or a camera's depth) to its colour, `rgb` does not."""
     encoder: str = "equivariant"
+    """`equivariant` (D4) or `plain`."""
     width: int = 64
+    """Regular fields n of the network; 64 gives the paper's 1.1 M parameters."""
     crop_size: int = 128
+    """Pixels the network sees; a random crop in training, the middle in evaluation."""
     gripper_input: Literal["image", "none"] = "image"
+    """`image` draws the gripper into the view as a channel and adds its height; `none` leaves the paper's channels,
+    colour, height and aperture.
+    """
     theta_representation: ThetaRepresentation = "sign"
+    """`sign`: yaw increments change sign in a mirror; `trivial`: the paper's text."""
     rotation_augmentation: bool = False
+    """Turn each training sample by a random angle, action included."""
     learning_rate: float = 1e-3
+    """Of Adam."""
     learning_rate_decay: Literal["none", "cosine"] = "none"
+    """`cosine` lowers the rate to zero over the training, `none` keeps it, as in the paper."""
     state_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
+    """Kind of each entry of `observation.state`, see `lerobot_policy_symview.symmetry`."""
     action_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
+    """Kind of each entry of `action`."""
     view_options: dict[str, Any] = field(default_factory=dict)
+    """Options of the view; filled in from the dataset where that has the view."""
     workspace: dict[str, Any] = field(default_factory=lambda: asdict(Workspace()))
+    """Constructor arguments of `Workspace`; filled in from the dataset."""
 
     # The policy scales actions itself, in a way that commutes with the group; per-axis statistics would not.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -152,8 +151,7 @@ class SymviewBcConfig(PreTrainedConfig):
             keys.STATE: PolicyFeature(FeatureType.STATE, tuple(features[keys.STATE]["shape"])),
             **{key: PolicyFeature(FeatureType.VISUAL, _channel_first(features, key)) for key in visuals},
         }
-        if self.output_features:
-            self.output_features = {keys.ACTION: self.output_features[keys.ACTION]}
+        self.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, tuple(features[keys.ACTION]["shape"]))}
 
     def _made_size(self) -> int:
         return make_view(self.view, **self.view_options).size if self.is_computed else 0

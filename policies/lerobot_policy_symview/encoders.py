@@ -41,7 +41,6 @@ class EquivariantEncoder(nn.Module):
     ):
         super().__init__()
         space = gspaces.flipRot2dOnR2(4)
-        group = space.fibergroup
         fields = {"vector": space.irrep(1, 1), "sign": space.irrep(1, 0), "trivial": space.trivial_repr}
         self.in_type = enn.FieldType(space, channels * [space.trivial_repr])
         layers: list[enn.EquivariantModule] = []
@@ -67,7 +66,8 @@ class EquivariantEncoder(nn.Module):
         out_type = enn.FieldType(space, [fields[name] for name in types])
         self.head = enn.R2Conv(current, out_type, 1, initialize=initialize)
         self.register_buffer("order", torch.tensor(order), persistent=False)
-        assert group.order() == 8
+        for buffer in self.buffers():  # escnn's bases are strided views, which safetensors cannot write
+            buffer.data = buffer.contiguous()
 
     def forward(self, images: Tensor) -> Tensor:
         """Map images (B, C, crop, crop) to scaled actions (B, A)."""
@@ -91,7 +91,7 @@ def _head_fields(kinds: Sequence[str], theta: ThetaRepresentation) -> tuple[list
 
 
 class PlainEncoder(nn.Module):
-    """The same layout without symmetry: widths 16, 32, 64, 128, 128, 256, 256 at 128 px and width 64 (1.13 M parameters)."""
+    """The same layout without symmetry; 16, 32, 64, 128, 128, 256, 256 channels and 1.13 M weights at the paper's size."""
 
     def __init__(
         self,

@@ -21,29 +21,26 @@ from lerobot_symview.views import make_view
 @EnvConfig.register_subclass("symview")
 @dataclass
 class SymviewEnvConfig(EnvConfig):
-    """PyBullet tabletop tasks seen by a freely placed RGBD camera.
-
-    Args:
-        task: which task, such as `block_picking`.
-        fps: actions per second of a robot that takes as long as the simulated one.
-        robot: which arm.
-        camera: where the camera stands and what it sees.
-        oracle: add the camera `top`, which looks straight down and does not see the arm.
-        views: views to add to each observation, for policies that do not compute their own.
-        view_size: rows and columns of those views.
-        start_jitter: largest random displacement of the gripper's start position per axis, metres.
-        max_steps: actions per episode.
-    """
+    """PyBullet tabletop tasks seen by a freely placed RGBD camera."""
 
     task: str = "block_picking"
+    """Which task, such as `block_picking`."""
     fps: int = 3
+    """Actions per second of a robot that takes as long as the simulated one."""
     robot: str = "panda"
+    """Which arm."""
     camera: CameraSpec = field(default_factory=CameraSpec)
+    """Where the camera stands and what it sees."""
     oracle: bool = False
+    """Add the camera `top`, which looks straight down and does not see the arm."""
     views: list[str] = field(default_factory=list)
+    """Views to add to each observation, for policies that do not compute their own."""
     view_size: int = 152
+    """Rows and columns of those views."""
     start_jitter: float = 0.0
+    """Largest random displacement of the gripper's start position per axis, metres."""
     max_steps: int = 50
+    """Actions per episode."""
 
     def __post_init__(self) -> None:
         names = [self.camera.name, *(["top"] if self.oracle else [])]
@@ -81,7 +78,9 @@ class SymviewEnvConfig(EnvConfig):
             _EnvFactory(SymviewEnv, {"task": self.task, **self.gym_kwargs})
         )
         if use_async_envs and n_envs > 1:
-            vector: gymnasium.vector.VectorEnv = gymnasium.vector.AsyncVectorEnv([make_one] * n_envs, context="forkserver")
+            vector: gymnasium.vector.VectorEnv = gymnasium.vector.AsyncVectorEnv(
+                [make_one] * n_envs, context="forkserver"
+            )
         else:
             vector = gymnasium.vector.SyncVectorEnv([make_one] * n_envs)
         return {self.type: {0: vector}}

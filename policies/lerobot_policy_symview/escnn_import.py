@@ -1,7 +1,7 @@
 """Imports escnn on machines where its optional dependency `lie_learn` does not build.
 
-escnn 1.0.11 imports `lie_learn` for rotations in three dimensions, of which planar groups use nothing; on Python 3.12 that
-package has no working build. Where it is missing, a stand-in is registered that fails when used.
+escnn 1.0.11 imports `lie_learn` for rotations in three dimensions, of which planar groups use nothing; on Python 3.12
+that package has no working build. Where it is missing, a stand-in is registered that fails when used.
 """
 
 from __future__ import annotations

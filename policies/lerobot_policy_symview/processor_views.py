@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from lerobot.lerobot_types import RobotObservation
+from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_symview import keys

@@ -1,7 +1,8 @@
 """How the entries of a state or an action change when the scene is turned or mirrored.
 
-The declaration is data: one kind per entry. `x` and `y` are the two components of a horizontal vector, `yaw` is an angle
-about the vertical (an orientation in a state, an increment in an action), `z`, `aperture` and `scalar` do not change.
+The declaration is data: one kind per entry. `x` and `y` are the two components of a horizontal vector, `yaw` is an
+angle about the vertical (an orientation in a state, an increment in an action), `z`, `aperture` and `scalar` do not
+change.
 """
 
 from __future__ import annotations

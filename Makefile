@@ -1,0 +1,35 @@
+# `make demo` and `make test` set everything up on a fresh Linux machine with any Python 3.8 or newer and a package index.
+SHELL := /bin/bash
+PYTHON := .venv/bin/python
+READY := .venv/.ready
+UV_VERSION := 0.13.9
+
+.PHONY: demo test lint setup doctor pins clean
+
+demo: $(READY) ## demonstrations, views, training, evaluation and a report in outputs/demo
+	@.venv/bin/symview-demo $(ARGS)
+
+test: $(READY) lint ## every test, slow ones included; `make test ARGS='-m "not slow"'` leaves those out
+	$(PYTHON) -m pytest $(ARGS)
+
+lint: $(READY)
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+setup: $(READY) ## the environment alone, in .venv
+
+doctor: $(READY) ## what is wrong with the environment, and the remedy
+	@.venv/bin/symview-doctor
+
+$(READY): pyproject.toml tools/uv.sh
+	@echo "Setting up .venv: Python $$(cat .python-version), LeRobot, PyTorch (about 3 GB) and PyBullet."
+	@echo "PyBullet has no wheel for this Python and is compiled once: 3 to 10 minutes. Later runs start in seconds."
+	@UV_VERSION=$(UV_VERSION) tools/uv.sh sync --all-extras
+	@touch $(READY)
+
+pins: ## write the versions installed now into pyproject.toml
+	@$(PYTHON) tools/pins.py
+
+clean: ## remove what the demo made
+	rm -rf outputs/demo

@@ -1,0 +1,42 @@
+"""PyBullet, imported and connected without the lines it prints about itself."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Discard what C code writes to standard output and standard error meanwhile."""
+    libc = ctypes.CDLL(None)
+    libc.fflush(None)
+    saved = {stream: os.dup(stream) for stream in (1, 2)}
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in saved:
+        os.dup2(null, stream)
+    try:
+        yield
+    finally:
+        libc.fflush(None)
+        for stream, copy in saved.items():
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(null)
+
+
+with _silenced():
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+
+
+def connect() -> Any:
+    """Return a new simulator without a window; its methods are PyBullet's functions bound to this simulator."""
+    with _silenced():
+        return BulletClient(connection_mode=pybullet.DIRECT)
+
+
+__all__ = ["connect", "pybullet"]

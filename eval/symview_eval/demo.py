@@ -1,0 +1,127 @@
+"""`symview-demo`: the whole pipeline on one task, from nothing to a report."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_symview.cli import run_command
+from symview_eval.report import write_report
+from symview_eval.stages import Stage, run_stages
+
+logger = logging.getLogger(__name__)
+
+EXAMPLES = """\
+  symview-demo
+  symview-demo --output_dir=outputs/small --demonstrations=10 --steps=200 --eval_episodes=10"""
+
+TASK = "block_picking"
+REPO_ID = f"symview/{TASK}"
+VIEWS_REPO_ID = f"{REPO_ID}_views"
+VIEW_SIZE = 76  # pixels: half the camera's, so that nearly every pixel of the view is seen by one of the camera
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Demonstrations, views, training, evaluation and a report, each by the command a user would type."""
+
+    output_dir: Path = Path("outputs/demo")
+    """Folder for everything; a second run continues what an interrupted one left."""
+    demonstrations: int = 50
+    """How many expert episodes to learn from."""
+    steps: int = 600
+    """Training steps."""
+    batch_size: int = 32
+    """Frames per training step."""
+    eval_episodes: int = 50
+    """Episodes of the evaluation."""
+    seed: int = 0
+    """Of the demonstrations and the training."""
+
+    def __post_init__(self) -> None:
+        for name in ("demonstrations", "steps", "batch_size", "eval_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+
+
+def stages(config: DemoConfig) -> list[Stage]:
+    """Return the five commands of the pipeline."""
+    folder = config.output_dir
+    recorded, views, policy, evaluation = (folder / name for name in ("recorded", "views", "policy", "evaluation"))
+    checkpoint = policy / "checkpoints" / "last" / "pretrained_model"
+    generate = (
+        "symview-generate",
+        f"--dataset.repo_id={REPO_ID}",
+        f"--dataset.root={recorded}",
+        f"--task={TASK}",
+        f"--episodes={config.demonstrations}",
+        f"--seed={config.seed}",
+    )
+    # Only the views go into the training set: LeRobot decodes every image of a frame, wanted or not.
+    add_views = (
+        "symview-add-views",
+        f"--dataset.repo_id={REPO_ID}",
+        f"--dataset.root={recorded}",
+        f"--new_repo_id={VIEWS_REPO_ID}",
+        f"--new_root={views}",
+        "--views=[reproj, persp]",
+        f"--size={VIEW_SIZE}",
+        "--keep=[]",
+    )
+    train = (
+        "lerobot-train",
+        f"--dataset.repo_id={VIEWS_REPO_ID}",
+        f"--dataset.root={views}",
+        "--policy.type=symview_bc",
+        "--policy.view=reproj",
+        "--policy.width=16",
+        "--policy.crop_size=64",
+        "--policy.rotation_augmentation=true",
+        "--policy.learning_rate_decay=cosine",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        f"--steps={config.steps}",
+        f"--batch_size={config.batch_size}",
+        "--num_workers=0",
+        f"--log_freq={max(1, config.steps // 40)}",
+        f"--save_freq={config.steps}",
+        "--env_eval_freq=0",
+        f"--seed={config.seed}",
+        f"--output_dir={policy}",
+    )
+    evaluate = (
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        "--policy.device=cpu",
+        "--env.type=symview",
+        f"--env.task={TASK}",
+        f"--eval.n_episodes={config.eval_episodes}",
+        f"--eval.batch_size={min(config.eval_episodes, 10)}",
+        "--eval.use_async_envs=false",
+        f"--output_dir={evaluation}",
+    )
+    return [
+        Stage("demonstrations", generate, recorded),
+        Stage("views", add_views, views),
+        Stage("training", train, policy),
+        Stage("evaluation", evaluate, evaluation),
+    ]
+
+
+def demo(config: DemoConfig) -> Path:
+    """Run the pipeline and return the report's path."""
+    # Hugging Face's libraries are told to stay off the network, and their cache stays with the results.
+    environment = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(config.output_dir.resolve() / "cache")}
+    pipeline = stages(config)
+    os.environ |= environment
+    seconds = run_stages(pipeline, config.output_dir, environment)
+    report = write_report(config.output_dir, pipeline, seconds)
+    logger.info("report: %s", report.resolve())
+    return report
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(DemoConfig, demo, EXAMPLES)

@@ -1,0 +1,164 @@
+"""`symview-doctor`: checks the environment for what people trip over and prints the remedy."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from lerobot_symview.cli import CommandError, run_command
+
+EXAMPLES = "  symview-doctor"
+
+REINSTALL = "run `make setup`, or follow the README's section on pip"
+
+
+@dataclass(frozen=True)
+class DoctorConfig:
+    """Check the environment and print a remedy for everything that is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found; `remedy` is empty when all is well."""
+
+    text: str
+    remedy: str = ""
+
+
+def check_python() -> Finding:
+    """LeRobot 0.6 and escnn agree on Python 3.12."""
+    version = sys.version.split()[0]
+    remedy = "" if sys.version_info[:2] == (3, 12) else "use Python 3.12"
+    return Finding(f"Python {version}", remedy)
+
+
+def check_lerobot() -> Finding:
+    """The plugin is written for LeRobot 0.6.1 and later 0.6 releases."""
+    version = importlib.metadata.version("lerobot")
+    release = tuple(int(part) for part in version.split(".")[:3])
+    remedy = "" if (0, 6, 1) <= release < (0, 7) else "pip install 'lerobot[training,evaluation]>=0.6.1,<0.7'"
+    return Finding(f"LeRobot {version}", remedy)
+
+
+def check_plugin() -> Finding:
+    """LeRobot finds plugins by the spelling of their distribution's name."""
+    names = {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}
+    if "lerobot_policy_symview" not in names:
+        return Finding(
+            "plugin not installed under a name that LeRobot recognises", "run `uv pip install -e .` in the repository"
+        )
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    missing = [f"--policy.type={n}" for n in ("symview_bc",) if n not in PreTrainedConfig.get_known_choices()]
+    missing += [f"--env.type={n}" for n in ("symview",) if n not in EnvConfig.get_known_choices()]
+    if missing:
+        return Finding(
+            f"plugin found, but {', '.join(missing)} not registered", "python -c 'import lerobot_policy_symview'"
+        )
+    return Finding("plugin discovered: --policy.type=symview_bc, --env.type=symview")
+
+
+def check_torch() -> Finding:
+    """Which device torch computes on; a CPU is enough for the demo."""
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding(f"torch {torch.__version__} on {torch.cuda.get_device_name()}")
+    return Finding(f"torch {torch.__version__} on the CPU, {torch.get_num_threads()} threads: pass --policy.device=cpu")
+
+
+def check_escnn() -> Finding:
+    """The networks need escnn without the dependencies it cannot build here."""
+    from lerobot_policy_symview.escnn_import import gspaces
+
+    space = gspaces.flipRot2dOnR2(4)
+    return Finding(f"escnn {importlib.metadata.version('escnn')} imports, {space.name}")
+
+
+def check_opencv() -> Finding:
+    """Two OpenCV distributions overwrite each other's files."""
+    installed = [
+        name
+        for name in (
+            "opencv-python",
+            "opencv-python-headless",
+            "opencv-contrib-python",
+            "opencv-contrib-python-headless",
+        )
+        if _is_installed(name)
+    ]
+    remedy = "" if len(installed) == 1 else f"pip uninstall {' '.join(installed)}; pip install opencv-python-headless"
+    import cv2
+
+    return Finding(f"OpenCV {cv2.__version__} from {' and '.join(installed)}", remedy)
+
+
+def check_pybullet() -> Finding:
+    """A pybullet that was compiled without numpy returns images as tuples."""
+    from symview_sim.bullet import pybullet
+
+    if pybullet.isNumpyEnabled():
+        return Finding("pybullet with numpy support")
+    return Finding(
+        "pybullet compiled without numpy support",
+        "pip install 'numpy>=2,<2.3' setuptools && "
+        "pip install --force-reinstall --no-deps --no-build-isolation --no-cache-dir pybullet==3.2.7",
+    )
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    check_python,
+    check_lerobot,
+    check_plugin,
+    check_torch,
+    check_escnn,
+    check_opencv,
+    check_pybullet,
+)
+
+
+def diagnose(checks: tuple[Callable[[], Finding], ...] = CHECKS) -> list[Finding]:
+    """Run every check; one that raises is a finding whose remedy is to install anew."""
+    findings = []
+    for check in checks:
+        try:
+            findings.append(check())
+        except Exception as error:  # a broken package fails in ways of its own: that is the finding
+            name = check.__name__.removeprefix("check_")
+            findings.append(Finding(f"{name}: {type(error).__name__}: {error}", REINSTALL))
+    return findings
+
+
+def doctor(config: DoctorConfig) -> None:
+    """Print every finding.
+
+    Raises:
+        CommandError: if anything is wrong.
+    """
+    findings = diagnose()
+    for finding in findings:
+        sys.stdout.write(f"{'!!' if finding.remedy else 'ok'}  {finding.text}\n")
+        if finding.remedy:
+            sys.stdout.write(f"    remedy: {finding.remedy}\n")
+    wrong = sum(bool(finding.remedy) for finding in findings)
+    if wrong:
+        raise CommandError(f"{wrong} of {len(findings)} checks failed")
+
+
+def main() -> None:
+    """Run the console command."""
+    run_command(DoctorConfig, doctor, EXAMPLES)

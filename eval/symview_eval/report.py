@@ -1,0 +1,100 @@
+"""The demo's report: one HTML page that needs nothing beside it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import platform
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from symview_eval.preview import TITLES, frame_images
+from symview_eval.stages import Stage
+from symview_eval.statistics import SuccessRate
+
+LOSS_LINE = re.compile(r"step:(\S+) .*?loss:(\S+)")
+MOMENT = 2  # frame of the first demonstration that is shown: the gripper is on its way, the arm in the picture
+SHOWN = ("side", "side_reproj", "side_persp", "top")
+PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "numpy")
+
+
+@dataclass(frozen=True)
+class LossPoint:
+    """Training loss averaged up to `step`."""
+
+    step: float
+    loss: float
+
+
+def read_losses(log: Path) -> list[LossPoint]:
+    """Return the losses that `lerobot-train` logged; its step counts may be abbreviated (1K)."""
+    text = log.read_text(errors="replace")
+    return [LossPoint(_number(step), float(loss)) for step, loss in LOSS_LINE.findall(text)]
+
+
+def _number(text: str) -> float:
+    return float(text[:-1]) * 1000 if text.endswith("K") else float(text)
+
+
+def read_success(evaluation: Path) -> SuccessRate:
+    """Return the success rate that `lerobot-eval` wrote into its output folder."""
+    overall = json.loads((evaluation / "eval_info.json").read_text())["overall"]
+    episodes = int(overall["n_episodes"])
+    return SuccessRate(round(overall["pc_success"] / 100 * episodes), episodes)
+
+
+def write_report(folder: Path, stages: Sequence[Stage], seconds: dict[str, float]) -> Path:
+    """Write `report.html` into `folder` from what the stages left there, and return its path."""
+    recorded, views, _, evaluation = (stage.result for stage in stages)
+    images = frame_images(recorded, MOMENT) | frame_images(views, MOMENT)
+    videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
+    template = jinja2.Environment(
+        loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
+    ).get_template("demo.html")
+    page = template.render(
+        success=read_success(evaluation),
+        moment=[(TITLES[name], _png(images[name])) for name in SHOWN],
+        videos=[_data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
+        chart=_loss_chart(read_losses(next((folder / "logs").glob("*-training.log")))),
+        stages=[(stage, seconds[stage.name]) for stage in stages],
+        total=sum(seconds.values()),
+        versions={name: version(name) for name in PACKAGES},
+        machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
+    )
+    report = folder / "report.html"
+    report.write_text(page)
+    return report
+
+
+def _loss_chart(points: Sequence[LossPoint]) -> str:
+    """Return an SVG data URI of the loss over steps, on a logarithmic axis."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 2.8), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy([point.step for point in points], [point.loss for point in points], color="#1f5fa8")
+    axes.set_xlabel("training step")
+    axes.set_ylabel("mean squared error")
+    axes.grid(alpha=0.3)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg")
+    return _data_uri("image/svg+xml", stream.getvalue())
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="PNG")
+    return _data_uri("image/png", stream.getvalue())
+
+
+def _data_uri(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

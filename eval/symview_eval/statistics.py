@@ -1,0 +1,34 @@
+"""Success rates with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scipy import stats
+
+
+@dataclass(frozen=True)
+class SuccessRate:
+    """`successes` of `episodes`, and the 95 % Wilson interval [low, high] of the rate, all in [0, 1]."""
+
+    successes: int
+    episodes: int
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.successes <= self.episodes or self.episodes == 0:
+            raise ValueError(f"{self.successes} successes of {self.episodes} episodes is not a rate")
+
+    @property
+    def rate(self) -> float:
+        """Fraction of successful episodes."""
+        return self.successes / self.episodes
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence interval (Wilson), which stays inside [0, 1]."""
+        interval = stats.binomtest(self.successes, self.episodes).proportion_ci(method="wilson")
+        return float(interval.low), float(interval.high)
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.rate:.0%} ({self.successes} of {self.episodes}; 95 % interval {low:.0%} to {high:.0%})"

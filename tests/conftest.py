@@ -1,0 +1,72 @@
+"""Shared fixtures: a tiny recorded dataset and the same with views, made once by the library itself."""
+
+import os
+import tempfile
+from pathlib import Path
+
+# Hugging Face's libraries read these when they are imported, which happens below.
+os.environ["HF_HUB_OFFLINE"] = "1"
+os.environ["HF_HOME"] = tempfile.mkdtemp(prefix="symview-hf-")
+os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
+
+import numpy as np
+import pytest
+
+from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.workspace import Workspace
+from symview_sim.generate import GenerateConfig, generate
+
+VIEW_SIZE = 76
+EPISODES = 2
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""
+    folder = tmp_path_factory.mktemp("data") / "recorded"
+    return generate(GenerateConfig(DatasetTarget("test/recorded", folder), episodes=EPISODES))
+
+
+@pytest.fixture(scope="session")
+def with_views(recorded: Path) -> Path:
+    """Folder of the same dataset with both views added."""
+    target = recorded.with_name("with_views")
+    config = AddViewsConfig(
+        DatasetTarget("test/recorded", recorded),
+        new_repo_id="test/with_views",
+        new_root=target,
+        views=["reproj", "persp"],
+        size=VIEW_SIZE,
+    )
+    return add_views(config)
+
+
+@pytest.fixture(scope="session")
+def only_views(recorded: Path) -> Path:
+    """Folder of the same dataset with the reprojected view in place of the cameras' images."""
+    target = recorded.with_name("only_views")
+    config = AddViewsConfig(
+        DatasetTarget("test/recorded", recorded),
+        new_repo_id="test/only_views",
+        new_root=target,
+        size=VIEW_SIZE,
+        keep=[],
+    )
+    return add_views(config)
+
+
+@pytest.fixture
+def workspace() -> Workspace:
+    return Workspace()
+
+
+def make_camera(elevation: float = 45.0, azimuth: float = 0.0, size: int = 152, fov: float = 48.0) -> Camera:
+    """A camera that looks at the default workspace's centre from 0.81 m; angles in degrees."""
+    return Camera(
+        intrinsics_from_fov(np.deg2rad(fov), size, size),
+        orbit_pose(np.deg2rad(elevation), np.deg2rad(azimuth), 0.81, (0.45, 0.0, 0.0)),
+        size,
+        size,
+    )

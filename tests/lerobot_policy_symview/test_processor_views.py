@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.envs.utils import preprocess_observation
+
+from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres
+from lerobot_symview import keys
+from lerobot_symview.views import VIEWS, make_view
+from symview_sim.env import SymviewEnv
+from symview_sim.generate import FIRST_SEED
+from tests.conftest import VIEW_SIZE
+
+OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
+
+
+@pytest.fixture(scope="module")
+def observed():
+    """A batch of one observation, as lerobot-eval hands it to the processors: the first frame of the recording."""
+    env = SymviewEnv("block_picking")
+    observation, _ = env.reset(seed=FIRST_SEED)
+    env.close()
+    batched = {
+        key: {name: image[None] for name, image in value.items()} if isinstance(value, dict) else value[None]
+        for key, value in observation.items()
+    }
+    return preprocess_observation(batched)
+
+
+def test_online_and_offline_views_are_the_same_bits(observed, with_views):
+    online = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
+    offline = LeRobotDataset("test/with_views", root=with_views, depth_output_unit="m")[0]
+    for name in VIEWS:
+        for output in make_view(name).outputs:
+            key = keys.view("side", output)
+            np.testing.assert_array_equal(online[key][0].numpy(), offline[key].numpy(), err_msg=key)
+
+
+def test_a_view_that_is_present_is_left_alone(observed):
+    step = ViewsProcessorStep(views={"reproj": {}})
+    first = step.observation(dict(observed))
+    marked = first | {"observation.images.side_reproj": torch.zeros(1, 3, 4, 4)}
+    assert step.observation(marked)["observation.images.side_reproj"].shape == (1, 3, 4, 4)
+
+
+def test_every_sample_of_a_batch_uses_its_own_calibration(observed):
+    two = {key: torch.cat([value, value]) for key, value in observed.items()}
+    pose = two[keys.world_from_cam("side")].clone().reshape(2, 4, 4)
+    pose[1, 0, 3] += 0.1
+    two[keys.world_from_cam("side")] = pose.reshape(2, 16)
+    images = ViewsProcessorStep(views=OPTIONS).observation(two)["observation.images.side_persp"]
+    alone = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))["observation.images.side_persp"]
+    assert torch.equal(images[:1], alone)
+    assert not torch.equal(images[1:], alone)
+
+
+def test_the_step_is_rebuilt_from_its_configuration(observed):
+    step = ViewsProcessorStep(views=OPTIONS, workspace={"center": [0.45, 0.0], "size": 0.3, "height_limit": 0.2})
+    again = ViewsProcessorStep(**step.get_config())
+    key = "observation.images.side_reproj"
+    assert torch.equal(again.observation(dict(observed))[key], step.observation(dict(observed))[key])
+
+
+def test_missing_inputs_are_named(observed):
+    without = {key: value for key, value in observed.items() if "intrinsics" not in key}
+    with pytest.raises(KeyError, match="observation.camera.side.intrinsics"):
+        ViewsProcessorStep(views=OPTIONS).observation(without)
+
+
+def test_metres_recognises_millimetres():
+    depth = torch.tensor([0.0, 0.8, 1.2])
+    torch.testing.assert_close(metres(depth), depth)
+    torch.testing.assert_close(metres(depth * 1000), depth)

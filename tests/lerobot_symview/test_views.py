@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from lerobot_symview.camera import Camera
+from lerobot_symview.views import VIEWS, Frame, make_view, register_view
+from lerobot_symview.workspace import Workspace
+from tests.conftest import make_camera
+
+SIZE = 32
+CENTRE = (0.45, 0.0)
+
+
+def make_frame(camera=None, gripper=(0.0, 0.0, 0.2, 0.0, 1.0), seed=0):
+    """Random colours over a smooth random relief, as `camera` could measure it."""
+    camera = camera or make_camera(size=96)
+    rng = np.random.default_rng(seed)
+    shape = (camera.height, camera.width)
+    depth = 0.75 + 0.05 * np.sin(np.arange(shape[0])[:, None] / 7) + 0.02 * rng.random(shape)
+    rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    return Frame(rgb, depth.astype(np.float32), camera, Workspace(), np.array(gripper))
+
+
+def turned(frame, quarter_turns):
+    """The same frame with camera and gripper turned about the workspace centre, which the world turned with."""
+    angle = quarter_turns * np.pi / 2
+    rotation = np.eye(4)
+    rotation[:2, :2] = np.rint([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centre = np.array([*CENTRE, 0.0])
+    rotation[:3, 3] = centre - rotation[:3, :3] @ centre
+    gripper = frame.gripper.copy()
+    gripper[:2] = rotation[:2, :2] @ gripper[:2]
+    gripper[3] += angle
+    camera = Camera(frame.camera.intrinsics, rotation @ frame.camera.world_from_cam, *frame.rgb.shape[:2])
+    return Frame(frame.rgb, frame.depth, camera, frame.workspace, gripper)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_outputs_have_the_declared_kinds_and_size(name):
+    view = make_view(name, size=SIZE)
+    images = view.render(make_frame())
+    assert list(images) == list(view.outputs)
+    for output, kind in view.outputs.items():
+        assert images[output].shape == ((SIZE, SIZE, 3) if kind == "rgb" else (SIZE, SIZE))
+        assert images[output].dtype == (np.uint8 if kind == "rgb" else np.float32)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_is_a_pure_function(name):
+    frame = make_frame()
+    before = frame.rgb.copy(), frame.depth.copy()
+    first, second = (make_view(name, size=SIZE).render(frame) for _ in range(2))
+    for output in first:
+        np.testing.assert_array_equal(first[output], second[output])
+    np.testing.assert_array_equal(frame.rgb, before[0])
+    np.testing.assert_array_equal(frame.depth, before[1])
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+@pytest.mark.parametrize(("name", "options"), [("reproj", {"infill": "none"}), ("persp", {})])
+def test_turning_camera_and_gripper_turns_the_view(name, options, quarter_turns):
+    view = make_view(name, size=SIZE, **options)
+    frame = make_frame(gripper=(0.05, -0.08, 0.2, 0.3, 0.8))
+    for output, image in view.render(turned(frame, quarter_turns)).items():
+        expected = np.rot90(view.render(frame)[output], quarter_turns).astype(float)
+        # the warp interpolates in fixed point, so a grey level may differ; a point on a bin's edge may change bins
+        assert (np.abs(image.astype(float) - expected) > (3 if name == "persp" else 1e-6)).mean() < 0.01
+
+
+def test_reprojection_from_the_oracles_place_is_the_image_itself():
+    size = 40
+    camera = make_camera(90.0, size=size, fov=2 * np.rad2deg(np.arctan(0.2 / 0.81)))
+    frame = make_frame(camera)
+    flat = Frame(frame.rgb, np.full((size, size), 0.81, dtype=np.float32), camera, frame.workspace, frame.gripper)
+    images = make_view("reproj", size=size).render(flat)
+    np.testing.assert_array_equal(images["reproj"], frame.rgb)
+    np.testing.assert_allclose(images["reproj_height"], 0.0, atol=1e-6)
+
+
+def test_points_above_the_gripper_never_appear():
+    frame = make_frame(gripper=(0.0, 0.0, 0.1, 0.0, 1.0))
+    free = make_view("reproj", size=SIZE, clip="none").render(frame)["reproj_height"]
+    cut = make_view("reproj", size=SIZE).render(frame)["reproj_height"]
+    assert free.max() > 0.09
+    assert cut.max() <= 0.09 + 1e-6
+
+
+def test_what_the_gripper_touches_stays_visible():
+    frame = make_frame(gripper=(0.0, 0.0, 0.02, 0.0, 1.0))
+    assert 0.03 < make_view("reproj", size=SIZE).render(frame)["reproj_height"].max() <= 0.06 + 1e-6
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_invalid_depth_never_writes(bad):
+    frame = make_frame()
+    depth = np.full_like(frame.depth, bad)
+    images = make_view("reproj", size=SIZE).render(
+        Frame(frame.rgb, depth, frame.camera, frame.workspace, frame.gripper)
+    )
+    assert images["reproj"].max() == 0
+    assert images["reproj_height"].max() == 0
+
+
+def test_reprojection_without_depth_names_the_alternative():
+    frame = make_frame()
+    with pytest.raises(ValueError, match="persp"):
+        make_view("reproj").render(Frame(frame.rgb, None, frame.camera, frame.workspace, frame.gripper))
+
+
+def test_an_unknown_view_is_answered_with_the_nearest_known_one():
+    with pytest.raises(ValueError, match="did you mean 'reproj'"):
+        make_view("reprojj")
+
+
+@pytest.mark.parametrize("options", [{"infill": "magic"}, {"clip": "high"}, {"size": 0}])
+def test_impossible_options_are_refused(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        make_view("reproj", **options)
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(ValueError, match="already"):
+        register_view("reproj")(object)

@@ -1,0 +1,42 @@
+import importlib.metadata
+
+import pytest
+
+from lerobot_symview.cli import CommandError
+from symview_eval import doctor
+
+
+def test_a_sound_environment_needs_no_remedy():
+    findings = doctor.diagnose()
+    assert len(findings) == len(doctor.CHECKS)
+    assert [finding for finding in findings if finding.remedy] == []
+
+
+def test_two_opencvs_are_found(monkeypatch):
+    monkeypatch.setattr(doctor, "_is_installed", lambda name: name in ("opencv-python", "opencv-python-headless"))
+    assert "pip uninstall opencv-python opencv-python-headless" in doctor.check_opencv().remedy
+
+
+def test_a_pybullet_without_numpy_is_found(monkeypatch):
+    from symview_sim import bullet
+
+    monkeypatch.setattr(bullet.pybullet, "isNumpyEnabled", lambda: 0)
+    assert "--no-build-isolation" in doctor.check_pybullet().remedy
+
+
+def test_a_lerobot_of_another_release_is_found(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.5.1")
+    assert "lerobot" in doctor.check_lerobot().remedy
+
+
+def test_a_check_that_raises_is_a_finding_with_a_remedy(monkeypatch, capsys):
+    def check_gears():
+        raise ImportError("no gears")
+
+    findings = doctor.diagnose((check_gears,))
+    monkeypatch.setattr(doctor, "diagnose", lambda: findings)
+    with pytest.raises(CommandError, match="1 of 1 checks failed"):
+        doctor.doctor(doctor.DoctorConfig())
+    output = capsys.readouterr().out
+    assert "gears: ImportError: no gears" in output
+    assert "remedy" in output

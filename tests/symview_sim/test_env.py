@@ -1,0 +1,117 @@
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from symview_sim import TASK_NAMES, gym_id
+from symview_sim.env import SymviewEnv
+from symview_sim.generate import FIRST_SEED
+
+DIGEST = """
+import hashlib, sys
+from symview_sim.env import SymviewEnv
+env = SymviewEnv(sys.argv[1], oracle=True)
+digest = hashlib.sha256()
+for seed in (3, 4):
+    observation, _ = env.reset(seed=seed)
+    for _ in range(4):
+        observation, *_ = env.step(env.expert_action())
+        digest.update(observation["pixels"]["side"].tobytes() + observation["images.side_depth"].tobytes())
+        digest.update(observation["agent_pos"].tobytes())
+sys.stdout.write(digest.hexdigest())
+"""
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_gymnasiums_own_checker_is_satisfied(task):
+    env = gymnasium.make(gym_id(task)).unwrapped
+    check_env(env, skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_episodes_are_bit_identical_across_processes(task):
+    digests = {
+        subprocess.run([sys.executable, "-c", DIGEST, task], check=True, capture_output=True, text=True).stdout
+        for _ in range(2)
+    }
+    assert len(digests) == 1
+    assert len(digests.pop()) == 64
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_environments_in_one_process_do_not_disturb_each_other(task):
+    alone, first, second = (SymviewEnv(task) for _ in range(3))
+    expected = [alone.reset(seed=7)[0]["pixels"]["side"]]
+    seen = [first.reset(seed=7)[0]["pixels"]["side"]]
+    second.reset(seed=8)
+    for _ in range(3):
+        expected.append(alone.step(alone.expert_action())[0]["pixels"]["side"])
+    for _ in range(3):
+        seen.append(first.step(first.expert_action())[0]["pixels"]["side"])
+        second.step(second.expert_action())
+    np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_expert_succeeds(task):
+    env = SymviewEnv(task)
+    outcomes, lengths = [], []
+    for seed in range(20):
+        env.reset(seed=FIRST_SEED + seed)
+        done, steps = False, 0
+        while not done:
+            _, _, terminated, truncated, info = env.step(env.expert_action())
+            done, steps = terminated or truncated, steps + 1
+        outcomes.append(info["is_success"])
+        lengths.append(steps)
+    assert sum(outcomes) >= 19
+    assert np.mean(lengths) <= 15
+
+
+def test_actions_are_clamped_to_the_stated_limits():
+    env = SymviewEnv("block_picking")
+    before, _ = env.reset(seed=0)
+    after, *_ = env.step(np.array([1.0, -1.0, 0.0, 10.0, 1.0]))
+    moved = after["agent_pos"] - before["agent_pos"]
+    np.testing.assert_allclose(moved[:3], [0.05, -0.05, 0.0], atol=0.004)
+    assert moved[3] == pytest.approx(np.pi / 4, abs=0.03)
+
+
+def test_success_is_a_python_bool_on_reset_and_step():
+    env = SymviewEnv("block_picking")
+    _, info = env.reset(seed=0)
+    assert info["is_success"] is False
+    *_, info = env.step(env.action_space.sample())
+    assert type(info["is_success"]) is bool
+
+
+def test_an_episode_ends_after_max_steps():
+    env = SymviewEnv("block_picking", max_steps=2)
+    env.reset(seed=0)
+    still = np.array([0, 0, 0, 0, 1], dtype=np.float32)
+    assert env.step(still)[2:4] == (False, False)
+    assert env.step(still)[2:4] == (False, True)
+
+
+def test_start_jitter_moves_the_start_and_follows_the_seed():
+    env = SymviewEnv("block_picking", start_jitter=0.03)
+    starts = [env.reset(seed=seed)[0]["agent_pos"][:3] for seed in (1, 2, 1)]
+    assert not np.allclose(starts[0], starts[1], atol=1e-3)
+    np.testing.assert_array_equal(starts[0], starts[2])
+
+
+def test_an_unknown_task_is_answered_with_the_nearest_known_one():
+    with pytest.raises(ValueError, match="did you mean 'block_picking'"):
+        SymviewEnv("block_piking")
+
+
+def test_naming_tasks_does_not_start_a_simulator():
+    code = (
+        "import sys, symview_sim, lerobot_symview;"
+        "sys.exit(bool({'pybullet', 'lerobot', 'torch'} & set(sys.modules)))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from lerobot_symview.camera import project, unproject
+from symview_sim.rendering import render
+from symview_sim.scene import Scene
+from tests.conftest import make_camera
+
+BOX = np.array([0.30, 0.24, 0.04])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    from lerobot_symview.workspace import Workspace
+
+    scene = Scene("panda", Workspace())
+    scene.reset(np.array([0.3, 0.0, 0.24]), 0.0)
+    scene.add_box(BOX, 0.0, 1.0, (0.9, 0.1, 0.1), np.array([0.45, 0.0, 0.02]), 0.0)
+    return scene
+
+
+@pytest.mark.parametrize(("elevation", "azimuth"), [(45, 0), (20, 50), (75, 200), (90, 0)])
+def test_depth_unprojects_to_the_known_surfaces(scene, elevation, azimuth):
+    """A half-pixel error in the renderer's pixel centres shows as 0.6 mm or more here."""
+    camera = make_camera(elevation, azimuth)
+    with scene.arm.hidden():
+        rgb, depth = render(scene.client, camera)
+    points = unproject(depth, camera)
+    inside = (np.abs(points[..., :2] - [0.45, 0.0]) < BOX[:2] / 2 - 0.01).all(axis=-1)
+    top = inside & (np.abs(points[..., 2] - 0.04) < 0.01)
+    assert top.sum() > 500
+    assert (rgb[top][:, 0] > 2 * rgb[top][:, 1]).all()
+    assert points[top][:, 2].mean() == pytest.approx(0.04, abs=2e-4)
+    table = (depth > 0) & ~(np.abs(points[..., :2] - [0.45, 0.0]) < BOX[:2] / 2 + 0.02).all(axis=-1)
+    np.testing.assert_allclose(points[table][:, 2], 0.0, atol=1e-6)
+
+
+def test_edges_appear_where_they_project(scene):
+    camera = make_camera(45.0)
+    with scene.arm.hidden():
+        rgb, _ = render(scene.client, camera)
+    red = rgb[..., 0].astype(int) > 2 * rgb[..., 1].astype(int)
+    near = np.array([[0.6, y, z] for y in (-0.12, 0.12) for z in (0.0, 0.04)])
+    pixels, _ = project(near, camera)
+    columns = np.flatnonzero(red[int(pixels[:, 1].mean())])
+    assert columns[0] == pytest.approx(pixels[:, 0].min(), abs=1.0)
+    assert columns[-1] == pytest.approx(pixels[:, 0].max(), abs=1.0)
+
+
+def test_above_the_horizon_depth_is_invalid(scene):
+    _, depth = render(scene.client, make_camera(10.0, 180.0))
+    assert (depth[0] == 0).any()
+    assert (depth[-1] > 0).all()
+
+
+def test_hiding_the_arm_removes_it_and_brings_it_back(scene):
+    camera = make_camera(45.0)
+    before = render(scene.client, camera)[1]
+    with scene.arm.hidden():
+        without = render(scene.client, camera)[1]
+    np.testing.assert_array_equal(render(scene.client, camera)[1], before)
+    assert (without != before).mean() > 0.005

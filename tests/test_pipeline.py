@@ -1,0 +1,146 @@
+"""The pipeline as a user runs it: console commands in processes of their own, on a tiny dataset."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from symview_eval.demo import DemoConfig, demo
+from symview_eval.report import read_losses, read_success
+
+BIN = Path(sys.executable).parent
+
+
+def run(*command, timeout=300):
+    environment = os.environ | {"COLUMNS": "200"}
+    return subprocess.run(
+        [str(BIN / command[0]), *map(str, command[1:])],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+        env=environment,
+    )
+
+
+@pytest.fixture(scope="module")
+def tiny_demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    config = DemoConfig(output_dir=folder, demonstrations=2, steps=4, batch_size=4, eval_episodes=2)
+    demo(config)
+    return config
+
+
+def test_every_stage_leaves_its_result(tiny_demo):
+    folder = tiny_demo.output_dir
+    info = json.loads((folder / "views" / "meta" / "info.json").read_text())
+    assert info["total_episodes"] == 2
+    assert {"observation.images.side_reproj", "observation.images.side_persp"} <= set(info["features"])
+    checkpoint = folder / "policy" / "checkpoints" / "last" / "pretrained_model"
+    assert (checkpoint / "model.safetensors").is_file()
+    assert json.loads((checkpoint / "config.json").read_text())["type"] == "symview_bc"
+    losses = read_losses(next((folder / "logs").glob("*-training.log")))
+    assert [point.step for point in losses] == [1, 2, 3, 4]
+    assert all(0 < point.loss < 10 for point in losses)
+    assert read_success(folder / "evaluation").episodes == 2
+
+
+def test_the_report_stands_alone(tiny_demo):
+    page = (tiny_demo.output_dir / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:video/mp4;base64,") == 2
+    assert page.count("data:image/svg+xml;base64,") == 1
+    for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval"):
+        assert f"<pre>{command} " in page
+    assert "src=\"http" not in page
+    assert "href=" not in page
+
+
+def test_a_second_run_redoes_nothing(tiny_demo):
+    folder = tiny_demo.output_dir
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
+    record = (folder / "stages.json").read_text()
+    demo(tiny_demo)
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")} == before
+    assert (folder / "stages.json").read_text() == record
+
+
+def test_lerobots_commands_list_our_options():
+    train = run("lerobot-train", "--policy.type=symview_bc", "--help")
+    for option in ("--policy.view", "--policy.crop_size", "--policy.rotation_augmentation"):
+        assert option in train.stdout
+    evaluate = run("lerobot-eval", "--env.type=symview", "--help")
+    for option in ("--env.task", "--env.camera.elevation", "--env.oracle", "--env.views"):
+        assert option in evaluate.stdout
+
+
+def test_a_stock_policy_trains_on_the_view_dataset(with_views, tmp_path):
+    result = run(
+        "lerobot-train",
+        "--dataset.repo_id=test/with_views",
+        f"--dataset.root={with_views}",
+        "--policy.type=act",
+        "--policy.pretrained_backbone_weights=null",
+        '--policy.input_features={"observation.images.side_reproj": {"type": "VISUAL", "shape": [3, 76, 76]}, '
+        '"observation.state": {"type": "STATE", "shape": [5]}}',
+        "--policy.dim_model=32",
+        "--policy.n_heads=2",
+        "--policy.dim_feedforward=32",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--steps=1",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        f"--output_dir={tmp_path / 'act'}",
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert (tmp_path / "act" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "message"),
+    [
+        (("symview-generate", "--dataset.repo_id=a/b", "--task=juggling"), 2, "unknown --task 'juggling'"),
+        (("symview-generate", "--dataset.repo_id=ab"), 2, "--dataset.repo_id must look like user/name, got 'ab'"),
+        (("symview-generate", "--dataset.repo_id=a/b", "--episodes=many"), 2, "many"),
+        (("symview-generate", "--dataset.repo_id=a/b", "--no_such_flag=1"), 2, "no_such_flag"),
+        (("symview-generate", "--dataset.repo_id=a/b", "--camera.elevation=-5"), 2, "elevation must lie in (0, 90]"),
+        (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "no dataset at"),
+        (("symview-add-views", "--dataset.repo_id=a/b", "--views=[reprojj]"), 2, "did you mean 'reproj'"),
+        (("symview-preview", "--dataset.repo_id=no/where"), 1, "no dataset at"),
+        (("symview-demo", "--steps=0"), 2, "--steps must be at least 1, got 0"),
+    ],
+)
+def test_a_users_mistake_is_one_line(command, code, message):
+    result = run(*command)
+    assert result.returncode == code
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    "command", ["symview-generate", "symview-add-views", "symview-preview", "symview-demo", "symview-doctor"]
+)
+def test_commands_explain_themselves(command):
+    result = run(command, "--help")
+    assert result.returncode == 0
+    assert "examples:" in result.stdout
+    assert f"  {command}" in result.stdout
+    assert run(command, "--version").stdout.startswith(f"{command} 0.")
+
+
+def test_a_preview_is_a_picture(with_views, tmp_path):
+    from PIL import Image
+
+    output = tmp_path / "frame.png"
+    result = run(
+        "symview-preview", "--dataset.repo_id=test/v", f"--dataset.root={with_views}", "--frame=3", f"--output={output}"
+    )
+    assert result.returncode == 0, result.stderr
+    width, height = Image.open(output).size
+    assert width > 5 * height

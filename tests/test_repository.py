@@ -1,0 +1,39 @@
+"""Rules about the repository itself."""
+
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_versions_are_pinned_without_addresses():
+    pins = PYPROJECT["tool"]["uv"]["constraint-dependencies"]
+    assert len(pins) > 50
+    for pin in pins:
+        assert re.fullmatch(r"[A-Za-z0-9_.\-]+==[^ /]+( ; .+)?", pin), pin
+
+
+def test_every_package_is_typed_and_documented():
+    for package in PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        assert (ROOT / package / "py.typed").is_file()
+        assert (ROOT / package / "__init__.py").read_text().startswith('"""')
+
+
+def test_packages_import_only_what_the_design_allows():
+    forbidden = {
+        "lerobot_symview": ("symview_sim", "lerobot_policy_symview", "symview_eval"),
+        "datasets_gen/symview_sim": ("lerobot_policy_symview", "symview_eval"),
+        "policies/lerobot_policy_symview": ("symview_eval",),
+    }
+    for package, others in forbidden.items():
+        for path in (ROOT / package).rglob("*.py"):
+            imported = re.findall(r"^\s*(?:from|import) (\w+)", path.read_text(), re.MULTILINE)
+            assert not set(imported) & set(others), path
+
+
+def test_the_readme_shows_the_commands_the_demo_runs():
+    readme = (ROOT / "README.md").read_text()
+    for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval", "symview-preview"):
+        assert f"\n{command} " in readme
