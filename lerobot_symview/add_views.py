@@ -174,11 +174,9 @@ def _write_stats(folder: Path, added: Features, images: list[dict[str, NDArray[A
         is_color = feature["shape"][-1] == 3
         stacked = np.stack([frame[key] for frame in images])
         channels_first = stacked.transpose(0, 3, 1, 2) if is_color else stacked[:, None]
-        values = get_feature_stats(channels_first, axis=(0, 2, 3), keepdims=True)
-        scale = 255.0 if is_color else 1.0
-        stats[key] = {
-            name: value.tolist() if name == "count" else (value / scale)[0].tolist() for name, value in values.items()
-        }
+        scaled = channels_first / 255.0 if is_color else channels_first.astype(np.float64)
+        values = get_feature_stats(scaled, axis=(0, 2, 3), keepdims=True)
+        stats[key] = {name: (value if name == "count" else value[0]).tolist() for name, value in values.items()}
     path.write_text(json.dumps(stats, indent=4))
 
 

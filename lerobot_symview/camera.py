@@ -136,11 +136,14 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
     """Lift a depth image to world points (paper Eq. 2-4).
 
     Args:
-        depth: (H, W) float, metres along the optical axis.
+        depth: (H, W) float, finite, metres along the optical axis.
         camera: its calibration.
 
     Returns:
-        (H, W, 3) float64, world coordinates in metres; meaningless where `depth` is.
+        (H, W, 3) float64, world coordinates in metres.
+
+    Raises:
+        ValueError: if the image's size is not the camera's.
     """
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")

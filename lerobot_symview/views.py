@@ -108,8 +108,9 @@ class ReprojectedView:
         """Return colour and height above the table; where nothing is known, black and 0."""
         if frame.depth is None:
             raise ValueError("the view 'reproj' needs depth; for a camera without it use 'persp'")
-        points = unproject(frame.depth, frame.camera).reshape(-1, 3)
-        valid = np.isfinite(frame.depth).ravel() & (frame.depth > 0).ravel()
+        measured = np.isfinite(frame.depth) & (frame.depth > 0)
+        points = unproject(np.where(measured, frame.depth, 0), frame.camera).reshape(-1, 3)
+        valid = measured.ravel()
         if self.clip == "gripper":
             ceiling = max(float(frame.gripper[2]) - self.clip_margin, self.clip_floor)
             valid &= points[:, 2] <= ceiling

@@ -55,7 +55,7 @@ def test_the_report_stands_alone(tiny_demo):
     assert page.count("data:image/svg+xml;base64,") == 1
     for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval"):
         assert f"<pre>{command} " in page
-    assert "src=\"http" not in page
+    assert 'src="http' not in page
     assert "href=" not in page
 
 

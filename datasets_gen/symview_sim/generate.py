@@ -54,7 +54,7 @@ class GenerateConfig:
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
     noise: float = 0.0
-    """Standard deviation of a disturbance of every motion, as a fraction of the largest motion (0.2: 1 cm and 9 degrees).
+    """Standard deviation of a disturbance of every motion, as a fraction of the largest one (0.2: 1 cm and 9 degrees).
     The expert's own action is what is recorded, so that the dataset shows how to recover from small errors.
     """
 
@@ -118,7 +118,9 @@ def demonstrations(env: Any, config: GenerateConfig) -> Iterator[Episode]:
             continue
         failed += 1
         if failed > 5 and failed > MAX_FAILURE_RATE * (recorded + failed):
-            raise CommandError(f"the expert failed {failed} of {recorded + failed} episodes: lower --noise or --start_jitter")
+            raise CommandError(
+                f"the expert failed {failed} of {recorded + failed} episodes: lower --noise or --start_jitter"
+            )
 
 
 def _demonstrate(env: Any, seed: int, noise: float) -> Episode | None:

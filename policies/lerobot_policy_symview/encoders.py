@@ -91,7 +91,7 @@ def _head_fields(kinds: Sequence[str], theta: ThetaRepresentation) -> tuple[list
 
 
 class PlainEncoder(nn.Module):
-    """The same layout without symmetry; 16, 32, 64, 128, 128, 256, 256 channels and 1.13 M weights at the paper's size."""
+    """The same layout without symmetry; 16, 32, 64, 128, 128, 256, 256 channels, 1.13 M weights at the paper's size."""
 
     def __init__(
         self,

@@ -14,7 +14,12 @@ from lerobot_policy_symview.symmetry import mirror, turn
 from lerobot_symview import keys
 
 COLOR, HEIGHT = "observation.images.side_reproj", "observation.images.side_reproj_height"
-STATS = {keys.ACTION: {"min": torch.tensor([-0.05, -0.03, -0.05, -0.6, 0.0]), "max": torch.tensor([0.04, 0.05, 0.05, 0.7, 1.0])}}
+STATS = {
+    keys.ACTION: {
+        "min": torch.tensor([-0.05, -0.03, -0.05, -0.6, 0.0]),
+        "max": torch.tensor([0.04, 0.05, 0.05, 0.7, 1.0]),
+    }
+}
 GROUP = [(turns, flipped) for flipped in (False, True) for turns in range(4)]
 
 
@@ -57,7 +62,7 @@ def transformed_action(action, config, turns, flipped):
 
 
 def violation(policy, preprocessor, postprocessor, turns, flipped):
-    """Largest difference between acting on the transformed scene and transforming the action, relative to the action."""
+    """Largest difference between acting on the transformed scene and transforming the action, relative."""
     raw = observation()
     expected = transformed_action(act(policy, preprocessor, postprocessor, raw), policy.config, turns, flipped)
     actual = act(policy, preprocessor, postprocessor, transformed(raw, policy.config, turns, flipped))
@@ -113,11 +118,15 @@ def test_the_action_scale_is_shared_by_x_and_y():
     torch.testing.assert_close(policy.action_center, torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
 
 
-@pytest.mark.parametrize("options", [{}, {"rotation_augmentation": True}, {"encoder": "plain"}, {"gripper_input": "none"}])
+@pytest.mark.parametrize(
+    "options", [{}, {"rotation_augmentation": True}, {"encoder": "plain"}, {"gripper_input": "none"}]
+)
 def test_a_policy_overfits_one_batch(options):
     policy, preprocessor, _ = make_policy(**options)
     policy.train()
-    batch = preprocessor(observation() | {keys.ACTION: torch.tensor([[0.04, 0.0, 0.02, 0.1, 1.0], [0.0, -0.03, 0.0, 0.3, 0.0]])})
+    batch = preprocessor(
+        observation() | {keys.ACTION: torch.tensor([[0.04, 0.0, 0.02, 0.1, 1.0], [0.0, -0.03, 0.0, 0.3, 0.0]])}
+    )
     optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
     losses = []
     for _ in range(40):

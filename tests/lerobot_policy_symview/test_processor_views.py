@@ -63,7 +63,7 @@ def test_the_step_is_rebuilt_from_its_configuration(observed):
 
 def test_missing_inputs_are_named(observed):
     without = {key: value for key, value in observed.items() if "intrinsics" not in key}
-    with pytest.raises(KeyError, match="observation.camera.side.intrinsics"):
+    with pytest.raises(KeyError, match=r"observation\.camera\.side\.intrinsics"):
         ViewsProcessorStep(views=OPTIONS).observation(without)
 
 

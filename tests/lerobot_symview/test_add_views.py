@@ -79,7 +79,10 @@ def test_a_view_says_how_it_was_made(with_views):
 
 def test_keep_drops_the_other_images(only_views):
     dataset = LeRobotDataset("test/only_views", root=only_views)
-    assert sorted(dataset.meta.camera_keys) == ["observation.images.side_reproj", "observation.images.side_reproj_height"]
+    assert sorted(dataset.meta.camera_keys) == [
+        "observation.images.side_reproj",
+        "observation.images.side_reproj_height",
+    ]
     assert keys.intrinsics("side") in dataset.meta.features
 
 

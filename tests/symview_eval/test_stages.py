@@ -7,7 +7,13 @@ from lerobot_symview.cli import CommandError
 from symview_eval.stages import Stage, run_stages
 
 PYTHON = Path(sys.executable).name
-COUNT = "import sys, pathlib; p = pathlib.Path(sys.argv[1]); p.with_suffix('.runs').open('a').write('x'); p.write_text('done')"
+COUNT = """
+import pathlib, sys
+path = pathlib.Path(sys.argv[1])
+with path.with_suffix(".runs").open("a") as stream:
+    stream.write("x")
+path.write_text("done")
+"""
 
 
 def counting(path, name, extra=""):
@@ -27,7 +33,7 @@ def test_finished_stages_are_not_run_again(tmp_path):
 
 def test_after_a_failure_the_pipeline_continues_at_the_failed_stage(tmp_path):
     first = counting(tmp_path / "a", "first")
-    failing = counting(tmp_path / "b", "second", extra="; sys.exit(3)")
+    failing = counting(tmp_path / "b", "second", extra="sys.exit(3)")
     with pytest.raises(CommandError, match=r"'second' failed with exit code 3.*2-second\.log"):
         run_stages([first, failing], tmp_path, {})
     run_stages([first, counting(tmp_path / "b", "second")], tmp_path, {})
@@ -47,6 +53,7 @@ def test_a_changed_command_or_missing_result_repeats_it_and_what_follows(tmp_pat
 
 def test_output_goes_to_the_log_and_the_environment_to_the_command(tmp_path, capfd):
     code = "import os, sys, pathlib; print(os.environ['GREETING']); pathlib.Path(sys.argv[1]).touch()"
-    run_stages([Stage("greet", (PYTHON, "-c", code, str(tmp_path / "g")), tmp_path / "g")], tmp_path, {"GREETING": "hello"})
+    stage = Stage("greet", (PYTHON, "-c", code, str(tmp_path / "g")), tmp_path / "g")
+    run_stages([stage], tmp_path, {"GREETING": "hello"})
     assert (tmp_path / "logs" / "1-greet.log").read_text() == "hello\n"
     assert "hello" in capfd.readouterr().err

@@ -111,7 +111,6 @@ def test_an_unknown_task_is_answered_with_the_nearest_known_one():
 
 def test_naming_tasks_does_not_start_a_simulator():
     code = (
-        "import sys, symview_sim, lerobot_symview;"
-        "sys.exit(bool({'pybullet', 'lerobot', 'torch'} & set(sys.modules)))"
+        "import sys, symview_sim, lerobot_symview;sys.exit(bool({'pybullet', 'lerobot', 'torch'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -49,7 +49,8 @@ def test_every_episode_ends_in_success(recorded):
 def test_the_camera_is_a_choice(tmp_path):
     camera = CameraSpec(name="front", size=64, elevation=30.0, azimuth=20.0)
     target = DatasetTarget("test/front", tmp_path / "front")
-    dataset = LeRobotDataset("test/front", root=generate(GenerateConfig(target, episodes=1, camera=camera, oracle=False)))
+    folder = generate(GenerateConfig(target, episodes=1, camera=camera, oracle=False))
+    dataset = LeRobotDataset("test/front", root=folder)
     assert sorted(dataset.meta.camera_keys) == ["observation.images.front", "observation.images.front_depth"]
     assert dataset.meta.features["observation.images.front"]["info"]["symview"]["placement"]["elevation"] == 30.0
 
