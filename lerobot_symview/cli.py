@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import NoReturn
 
-USAGE, FAILURE = 2, 1
+USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval")
 
 
@@ -57,18 +59,25 @@ def run_command[Config](config_class: type[Config], main: Callable[[Config], obj
     _quiet()
     if {"-h", "--help"} & set(sys.argv[1:]):
         sys.stdout.write(f"{config_class.__doc__ or ''}\n\nexamples:\n{examples}\n\n")
+    complaints = io.StringIO()
     try:
-        config = draccus.parse(config_class)
+        with redirect_stderr(complaints):
+            config = draccus.parse(config_class)
+    except SystemExit as end:  # argparse: help was printed, or a flag is unknown and the usage precedes the reason
+        reason = complaints.getvalue().strip().rpartition("error: ")[2]
+        if end.code:
+            _end(program, reason, USAGE)
+        raise
     except Exception as error:  # draccus raises what a field's type raises: each is a wrong flag
-        _end(program, error, USAGE)
+        _end(program, _reasons(error), USAGE)
     try:
         main(config)
     except (CommandError, OSError) as error:
-        _end(program, error, FAILURE)
+        _end(program, str(error), FAILURE)
     except ValueError as error:
-        _end(program, error, USAGE)
+        _end(program, str(error), USAGE)
     except KeyboardInterrupt:
-        _end(program, CommandError("interrupted"), 130)
+        _end(program, "interrupted", INTERRUPTED)
     sys.exit(0)
 
 
@@ -83,9 +92,16 @@ def _quiet() -> None:
         logging.getLogger(package).setLevel(logging.INFO)
 
 
-def _end(program: str, error: Exception, code: int) -> Any:
-    cause: BaseException = error
-    while cause.__cause__ is not None and code == USAGE:  # draccus wraps the message that names the value
-        cause = cause.__cause__
-    sys.stderr.write(f"{program}: error: {' '.join(str(cause).split())}\n")
+def _reasons(error: BaseException) -> str:
+    """Join an error's message with those of its causes: draccus names the field, its cause the value."""
+    messages = [str(error)]
+    while error.__cause__ is not None:
+        error = error.__cause__
+        if str(error) not in messages[-1]:
+            messages.append(str(error))
+    return ": ".join(message for message in messages if not message.startswith("Couldn't instantiate class"))
+
+
+def _end(program: str, reason: str, code: int) -> NoReturn:
+    sys.stderr.write(f"{program}: error: {' '.join(reason.split())}\n")
     sys.exit(code)

@@ -33,10 +33,15 @@ with _silenced():
     from pybullet_utils.bullet_client import BulletClient
 
 
+class _Client(BulletClient):
+    def __del__(self) -> None:
+        """Leave disconnecting to the scene: at the interpreter's exit BulletClient's own attempt fails noisily."""
+
+
 def connect() -> Any:
     """Return a new simulator without a window; its methods are PyBullet's functions bound to this simulator."""
     with _silenced():
-        return BulletClient(connection_mode=pybullet.DIRECT)
+        return _Client(connection_mode=pybullet.DIRECT)
 
 
 __all__ = ["connect", "pybullet"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ class Scene:
     def __init__(self, robot: str, workspace: Workspace):
         self.client: Any = connect()
         self.client.setAdditionalSearchPath(pybullet_data.getDataPath())
+        self._disconnect = weakref.finalize(self, self.client.disconnect)
         self.workspace = workspace
         self._robot = lookup("robot", robot, ROBOTS)
         self.arm: Arm
@@ -71,5 +73,4 @@ class Scene:
 
     def close(self) -> None:
         """Disconnect from the simulator."""
-        if self.client.isConnected():
-            self.client.disconnect()
+        self._disconnect()
