@@ -44,4 +44,9 @@ def connect() -> Any:
         return _Client(connection_mode=pybullet.DIRECT)
 
 
-__all__ = ["connect", "pybullet"]
+def disconnect(client: Any) -> None:
+    """Shut a simulator down."""
+    client.disconnect()
+
+
+__all__ = ["connect", "disconnect", "pybullet"]

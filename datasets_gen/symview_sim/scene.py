@@ -11,7 +11,7 @@ import pybullet_data
 from lerobot_symview.camera import Array
 from lerobot_symview.names import lookup
 from lerobot_symview.workspace import Workspace
-from symview_sim.bullet import connect, pybullet
+from symview_sim.bullet import connect, disconnect, pybullet
 from symview_sim.robots import ROBOTS, Arm
 
 GRAVITY = -9.81
@@ -29,7 +29,7 @@ class Scene:
     def __init__(self, robot: str, workspace: Workspace):
         self.client: Any = connect()
         self.client.setAdditionalSearchPath(pybullet_data.getDataPath())
-        self._disconnect = weakref.finalize(self, self.client.disconnect)
+        self._disconnect = weakref.finalize(self, disconnect, self.client)
         self.workspace = workspace
         self._robot = lookup("robot", robot, ROBOTS)
         self.arm: Arm
