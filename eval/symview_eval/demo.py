@@ -29,7 +29,7 @@ class DemoConfig:
 
     output_dir: Path = Path("outputs/demo")
     """Folder for everything; a second run continues what an interrupted one left."""
-    demonstrations: int = 50
+    demonstrations: int = 100
     """How many expert episodes to learn from."""
     steps: int = 600
     """Training steps."""
@@ -57,6 +57,7 @@ def stages(config: DemoConfig) -> list[Stage]:
         f"--dataset.root={recorded}",
         f"--task={TASK}",
         f"--episodes={config.demonstrations}",
+        "--noise=0.1",
         f"--seed={config.seed}",
     )
     # Only the views go into the training set: LeRobot decodes every image of a frame, wanted or not.
@@ -78,7 +79,6 @@ def stages(config: DemoConfig) -> list[Stage]:
         "--policy.view=reproj",
         "--policy.width=16",
         "--policy.crop_size=64",
-        "--policy.rotation_augmentation=true",
         "--policy.learning_rate_decay=cosine",
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
