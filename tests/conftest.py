@@ -26,7 +26,7 @@ EPISODES = 2
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""
     folder = tmp_path_factory.mktemp("data") / "recorded"
-    return generate(GenerateConfig(DatasetTarget("test/recorded", folder), episodes=EPISODES))
+    return generate(GenerateConfig(DatasetTarget("test/recorded", folder), num_episodes=EPISODES))
 
 
 @pytest.fixture(scope="session")

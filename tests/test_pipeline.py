@@ -73,7 +73,7 @@ def test_lerobots_commands_list_our_options():
     for option in ("--policy.view", "--policy.crop_size", "--policy.rotation_augmentation"):
         assert option in train.stdout
     evaluate = run("lerobot-eval", "--env.type=symview", "--help")
-    for option in ("--env.task", "--env.camera.elevation", "--env.oracle", "--env.views"):
+    for option in ("--env.task", "--env.camera.elevation_deg", "--env.oracle", "--env.views"):
         assert option in evaluate.stdout
 
 
@@ -104,11 +104,15 @@ def test_a_stock_policy_trains_on_the_view_dataset(with_views, tmp_path):
 @pytest.mark.parametrize(
     ("command", "code", "message"),
     [
-        (("symview-generate", "--dataset.repo_id=a/b", "--task=juggling"), 2, "unknown --task 'juggling'"),
+        (("symview-generate", "--dataset.repo_id=a/b", "--env.task=juggling"), 2, "unknown task 'juggling'"),
         (("symview-generate", "--dataset.repo_id=ab"), 2, "--dataset.repo_id must look like user/name, got 'ab'"),
-        (("symview-generate", "--dataset.repo_id=a/b", "--episodes=many"), 2, "many"),
+        (("symview-generate", "--dataset.repo_id=a/b", "--num_episodes=many"), 2, "many"),
         (("symview-generate", "--dataset.repo_id=a/b", "--no_such_flag=1"), 2, "no_such_flag"),
-        (("symview-generate", "--dataset.repo_id=a/b", "--camera.elevation=-5"), 2, "elevation must lie in (0, 90]"),
+        (
+            ("symview-generate", "--dataset.repo_id=a/b", "--env.camera.elevation_deg=-5"),
+            2,
+            "elevation_deg must lie in (0, 90]",
+        ),
         (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "no dataset at"),
         (("symview-add-views", "--dataset.repo_id=a/b", "--views=[reprojj]"), 2, "did you mean 'reproj'"),
         (("symview-preview", "--dataset.repo_id=no/where"), 1, "no dataset at"),

@@ -15,16 +15,14 @@ from tqdm import tqdm
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget, run_command
 from lerobot_symview.features import Features, camera_features
-from lerobot_symview.names import lookup
-from lerobot_symview.placement import CameraSpec
 from lerobot_symview.staging import staged
-from symview_sim.tasks import TASK_NAMES
+from symview_sim.settings import EnvSettings
 
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """\
-  symview-generate --dataset.repo_id=me/picking --task=block_picking --episodes=50
-  symview-generate --dataset.repo_id=me/low --dataset.root=data/low --camera.elevation=20 --oracle=false"""
+  symview-generate --dataset.repo_id=me/picking --env.task=block_picking --num_episodes=50
+  symview-generate --dataset.repo_id=me/low --dataset.root=data/low --env.camera.elevation_deg=20 --env.oracle=false"""
 
 # lerobot-eval seeds its episodes from 1000 upwards: demonstrations are drawn from elsewhere.
 FIRST_SEED = 1_000_000
@@ -34,34 +32,33 @@ Episode = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
+class RecordedEnv(EnvSettings):
+    """The environment of a recording, which shows the oracle too."""
+
+    oracle: bool = True
+    """Also record `top`, which looks straight down and does not see the arm."""
+
+
+@dataclass(frozen=True)
 class GenerateConfig:
     """Let a task's expert demonstrate it and record what the cameras see."""
 
     dataset: DatasetTarget
     """Where the dataset goes."""
-    task: str = "block_picking"
-    """Which task."""
-    episodes: int = 50
+    env: RecordedEnv = field(default_factory=RecordedEnv)
+    """What is demonstrated, and which cameras see it."""
+    num_episodes: int = 50
     """How many successful demonstrations."""
     seed: int = 0
     """Chooses the scenes: episode i starts from seed 1,000,000 (seed + 1) + i."""
-    robot: str = "panda"
-    """Which arm."""
-    camera: CameraSpec = field(default_factory=CameraSpec)
-    """Where the camera stands."""
-    oracle: bool = True
-    """Also record `top`, which looks straight down and does not see the arm."""
-    start_jitter: float = 0.0
-    """Largest random displacement of the gripper's start position per axis, metres."""
     noise: float = 0.0
     """Standard deviation of a disturbance of every motion, as a fraction of the largest one (0.2: 1 cm and 9 degrees).
     The expert's own action is what is recorded, so that the dataset shows how to recover from small errors.
     """
 
     def __post_init__(self) -> None:
-        lookup("--task", self.task, dict.fromkeys(TASK_NAMES))
-        if self.episodes < 1:
-            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+        if self.num_episodes < 1:
+            raise ValueError(f"--num_episodes must be at least 1, got {self.num_episodes}")
         if self.seed < 0:
             raise ValueError(f"--seed must not be negative, got {self.seed}")
         if not 0 <= self.noise <= 1:
@@ -74,43 +71,37 @@ def generate(config: GenerateConfig) -> Path:
     with staged(target, "--dataset.root") as partial:
         from lerobot.datasets import LeRobotDataset
 
-        from symview_sim.env import SymviewEnv
-
-        env = SymviewEnv(
-            config.task,
-            robot=config.robot,
-            cameras=(config.camera,),
-            oracle=config.oracle,
-            start_jitter=config.start_jitter,
-        )
+        env = config.env.make()
         dataset = LeRobotDataset.create(
             config.dataset.repo_id,
-            fps=SymviewEnv.metadata["render_fps"],
+            fps=env.metadata["render_fps"],
             features=_features(env, config),
             root=partial,
-            robot_type=config.robot,
+            robot_type=config.env.robot,
             use_videos=False,
         )
         steps = 0
-        for episode in tqdm(demonstrations(env, config), desc=config.task, total=config.episodes, unit="episode"):
+        for episode in tqdm(
+            demonstrations(env, config), desc=config.env.task, total=config.num_episodes, unit="episode"
+        ):
             for frame in episode:
                 dataset.add_frame(frame | {"task": env.task_description})
             dataset.save_episode()
             steps += len(episode)
         dataset.finalize()
         env.close()
-    logger.info("wrote %d demonstrations, %d frames, to %s", config.episodes, steps, target)
+    logger.info("wrote %d demonstrations, %d frames, to %s", config.num_episodes, steps, target)
     return target
 
 
 def demonstrations(env: Any, config: GenerateConfig) -> Iterator[Episode]:
-    """Yield `config.episodes` successful episodes, each a list of dataset frames; failed ones are left out.
+    """Yield `config.num_episodes` successful episodes, each a list of dataset frames; failed ones are left out.
 
     Raises:
         CommandError: when more than a fifth of the episodes fail, which an expert's never do.
     """
     recorded, failed = 0, 0
-    while recorded < config.episodes:
+    while recorded < config.num_episodes:
         episode = _demonstrate(env, FIRST_SEED * (config.seed + 1) + recorded + failed, config.noise)
         if episode is not None:
             recorded += 1
@@ -119,7 +110,7 @@ def demonstrations(env: Any, config: GenerateConfig) -> Iterator[Episode]:
         failed += 1
         if failed > 5 and failed > MAX_FAILURE_RATE * (recorded + failed):
             raise CommandError(
-                f"the expert failed {failed} of {recorded + failed} episodes: lower --noise or --start_jitter"
+                f"the expert failed {failed} of {recorded + failed} episodes: lower --noise or --env.start_jitter"
             )
 
 
@@ -160,10 +151,10 @@ def _frame(observation: dict[str, Any], cameras: dict[str, Any]) -> dict[str, An
 def _features(env: Any, config: GenerateConfig) -> Features:
     facts = {
         "workspace": asdict(env.workspace),
-        "task": config.task,
+        "task": config.env.task,
         "seed": config.seed,
         "noise": config.noise,
-        "placement": asdict(config.camera),
+        "placement": asdict(config.env.camera),
         "pybullet": version("pybullet"),
     }
     features: Features = {

@@ -55,8 +55,8 @@ def stages(config: DemoConfig) -> list[Stage]:
         "symview-generate",
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={recorded}",
-        f"--task={TASK}",
-        f"--episodes={config.demonstrations}",
+        f"--env.task={TASK}",
+        f"--num_episodes={config.demonstrations}",
         "--noise=0.1",
         f"--seed={config.seed}",
     )

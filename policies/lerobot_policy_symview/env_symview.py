@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -59,28 +58,21 @@ class SymviewEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of the Gymnasium environment."""
-        return {
-            "robot": self.robot,
-            "cameras": (self.camera,),
-            "oracle": self.oracle,
-            "start_jitter": self.start_jitter,
-            "max_steps": self.max_steps,
-        }
+        """Settings of the simulated environment, see `symview_sim.settings.EnvSettings`."""
+        names = ("task", "robot", "camera", "oracle", "start_jitter", "max_steps")
+        return {name: getattr(self, name) for name in names}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
         """Return `{"symview": {0: a vector environment of n_envs}}`; asynchronous only where it has several."""
-        from symview_sim.env import SymviewEnv
+        from symview_sim.settings import EnvSettings
 
-        make_one: Callable[[], gymnasium.Env[Any, Any]] = freeze_after_episode_end(
-            _EnvFactory(SymviewEnv, {"task": self.task, **self.gym_kwargs})
-        )
+        # A bound method of plain settings: simulator processes unpickle it without importing LeRobot's registries.
+        make_one = freeze_after_episode_end(EnvSettings(**self.gym_kwargs).make)
+        vector: gymnasium.vector.VectorEnv
         if use_async_envs and n_envs > 1:
-            vector: gymnasium.vector.VectorEnv = gymnasium.vector.AsyncVectorEnv(
-                [make_one] * n_envs, context="forkserver"
-            )
+            vector = gymnasium.vector.AsyncVectorEnv([make_one] * n_envs, context="forkserver")
         else:
             vector = gymnasium.vector.SyncVectorEnv([make_one] * n_envs)
         return {self.type: {0: vector}}
@@ -90,14 +82,3 @@ class SymviewEnvConfig(EnvConfig):
         options = {view: {"size": self.view_size} for view in self.views}
         step = ViewsProcessorStep(views=options, camera=self.camera.name)
         return PolicyProcessorPipeline(steps=[step] if options else []), PolicyProcessorPipeline(steps=[])
-
-
-@dataclass(frozen=True)
-class _EnvFactory:
-    """A constructor call that a simulator process can unpickle without importing LeRobot's registries."""
-
-    env_class: Callable[..., gymnasium.Env[Any, Any]]
-    arguments: dict[str, Any]
-
-    def __call__(self) -> gymnasium.Env[Any, Any]:
-        return self.env_class(**self.arguments)

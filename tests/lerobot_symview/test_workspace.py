@@ -28,11 +28,13 @@ def test_the_default_camera_sees_the_whole_working_volume(workspace, elevation):
 
 def test_a_camera_that_looks_elsewhere_is_refused_with_the_fraction_it_sees(workspace):
     with pytest.raises(ValueError, match=r"sees \d+% of the workspace"):
-        CameraSpec(fov=8.0).place(workspace)
+        CameraSpec(fov_deg=8.0).place(workspace)
 
 
 @pytest.mark.parametrize(
-    "fields", [{"elevation": 0.0}, {"elevation": 91.0}, {"size": 2}, {"name": "my camera"}], ids=lambda f: str(f)
+    "fields",
+    [{"elevation_deg": 0.0}, {"elevation_deg": 91.0}, {"size": 2}, {"name": "my camera"}],
+    ids=lambda f: str(f),
 )
 def test_impossible_placements_are_refused(fields):
     with pytest.raises(ValueError, match=next(iter(fields))):

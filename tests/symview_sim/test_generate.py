@@ -6,7 +6,7 @@ from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.placement import CameraSpec
 from symview_sim.env import SymviewEnv
-from symview_sim.generate import FIRST_SEED, GenerateConfig, generate
+from symview_sim.generate import FIRST_SEED, GenerateConfig, RecordedEnv, generate
 from tests.conftest import EPISODES
 
 
@@ -47,27 +47,27 @@ def test_every_episode_ends_in_success(recorded):
 
 
 def test_the_camera_is_a_choice(tmp_path):
-    camera = CameraSpec(name="front", size=64, elevation=30.0, azimuth=20.0)
+    camera = CameraSpec(name="front", size=64, elevation_deg=30.0, azimuth_deg=20.0)
     target = DatasetTarget("test/front", tmp_path / "front")
-    folder = generate(GenerateConfig(target, episodes=1, camera=camera, oracle=False))
+    folder = generate(GenerateConfig(target, RecordedEnv(camera=camera, oracle=False), num_episodes=1))
     dataset = LeRobotDataset("test/front", root=folder)
     assert sorted(dataset.meta.camera_keys) == ["observation.images.front", "observation.images.front_depth"]
-    assert dataset.meta.features["observation.images.front"]["info"]["symview"]["placement"]["elevation"] == 30.0
+    assert dataset.meta.features["observation.images.front"]["info"]["symview"]["placement"]["elevation_deg"] == 30.0
 
 
 def test_an_existing_dataset_is_not_overwritten(recorded):
     with pytest.raises(CommandError, match="exists already"):
-        generate(GenerateConfig(DatasetTarget("test/recorded", recorded), episodes=1))
+        generate(GenerateConfig(DatasetTarget("test/recorded", recorded), num_episodes=1))
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path):
-    camera = CameraSpec(fov=5.0)
+    camera = CameraSpec(fov_deg=5.0)
     with pytest.raises(ValueError, match="of the workspace"):
-        generate(GenerateConfig(DatasetTarget("test/none", tmp_path / "none"), camera=camera))
+        generate(GenerateConfig(DatasetTarget("test/none", tmp_path / "none"), RecordedEnv(camera=camera)))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [{"episodes": 0}, {"task": "juggling"}, {"seed": -1}])
+@pytest.mark.parametrize("options", [{"num_episodes": 0}, {"noise": 2.0}, {"seed": -1}])
 def test_impossible_requests_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         GenerateConfig(DatasetTarget("a/b"), **options)

@@ -1,0 +1,51 @@
+"""What an environment is made from, as plain settings that name a task without starting a simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from lerobot_symview.names import lookup
+from lerobot_symview.placement import CameraSpec
+from symview_sim.tasks import TASK_NAMES
+
+if TYPE_CHECKING:
+    from symview_sim.env import SymviewEnv
+
+
+@dataclass(frozen=True)
+class EnvSettings:
+    """A task, an arm and a camera."""
+
+    task: str = "block_picking"
+    """Which task."""
+    robot: str = "panda"
+    """Which arm."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """Where the camera stands."""
+    oracle: bool = False
+    """Add the camera `top`, which looks straight down and does not see the arm."""
+    start_jitter: float = 0.0
+    """Largest random displacement of the gripper's start position per axis, metres."""
+    max_steps: int = 50
+    """Actions per episode."""
+
+    def __post_init__(self) -> None:
+        lookup("task", self.task, dict.fromkeys(TASK_NAMES))
+        if self.start_jitter < 0:
+            raise ValueError(f"--env.start_jitter must not be negative, got {self.start_jitter}")
+        if self.max_steps < 1:
+            raise ValueError(f"--env.max_steps must be at least 1, got {self.max_steps}")
+
+    def make(self) -> SymviewEnv:
+        """Return the environment; this starts PyBullet."""
+        from symview_sim.env import SymviewEnv
+
+        return SymviewEnv(
+            self.task,
+            robot=self.robot,
+            cameras=(self.camera,),
+            oracle=self.oracle,
+            start_jitter=self.start_jitter,
+            max_steps=self.max_steps,
+        )
