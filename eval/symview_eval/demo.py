@@ -116,8 +116,11 @@ def demo(config: DemoConfig) -> Path:
     environment = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(config.output_dir.resolve() / "cache")}
     pipeline = stages(config)
     os.environ |= environment
+    report = config.output_dir / "report.html"
+    before = (config.output_dir / "stages.json").read_bytes() if report.exists() else b""
     seconds = run_stages(pipeline, config.output_dir, environment)
-    report = write_report(config.output_dir, pipeline, seconds)
+    if (config.output_dir / "stages.json").read_bytes() != before:
+        write_report(report, pipeline, seconds)
     logger.info("report: %s", report.resolve())
     return report
 

@@ -52,8 +52,8 @@ def read_success(evaluation: Path) -> SuccessRate:
     return SuccessRate(round(overall["pc_success"] / 100 * episodes), episodes)
 
 
-def write_report(folder: Path, stages: Sequence[Stage], seconds: dict[str, float]) -> Path:
-    """Write `report.html` into `folder` from what the stages left there, and return its path."""
+def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float]) -> None:
+    """Write the page `report` from what the stages left in its folder."""
     recorded, views, _, evaluation = (stage.result for stage in stages)
     images = frame_images(recorded, MOMENT) | frame_images(views, MOMENT)
     videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
@@ -64,15 +64,13 @@ def write_report(folder: Path, stages: Sequence[Stage], seconds: dict[str, float
         success=read_success(evaluation),
         moment=[(TITLES[name], _png(images[name])) for name in SHOWN],
         videos=[_data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
-        chart=_loss_chart(read_losses(next((folder / "logs").glob("*-training.log")))),
+        chart=_loss_chart(read_losses(next((report.parent / "logs").glob("*-training.log")))),
         stages=[(stage, seconds[stage.name]) for stage in stages],
         total=sum(seconds.values()),
         versions={name: version(name) for name in PACKAGES},
         machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
-    report = folder / "report.html"
     report.write_text(page)
-    return report
 
 
 def _loss_chart(points: Sequence[LossPoint]) -> str:

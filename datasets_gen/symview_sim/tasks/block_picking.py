@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_symview.camera import Array
-from symview_sim.motions import MAX_STEP, nearest_turn, step_towards
+from symview_sim.motions import MAX_STEP, is_there, nearest_turn, step_towards
 from symview_sim.scene import Scene
 from symview_sim.tasks.base import Task
 
@@ -36,13 +36,13 @@ class BlockPicking(Task):
         return bool((offset < scene.workspace.size / 2).all())
 
     def expert_action(self, scene: Scene) -> Array:
-        """Go straight to the cube, close on arrival, lift once it is held."""
+        """Go straight to the cube, close when there, lift once it is held."""
         position, yaw = scene.pose(self._cube)
         if scene.arm.holds(self._cube):
             return np.array([0.0, 0.0, MAX_STEP, 0.0, 0.0])
         turn = nearest_turn(scene.arm.yaw, yaw, period=np.pi / 2)
-        motion, arrives = step_towards(scene.arm.position, position, turn)
-        return np.append(motion, 0.0 if arrives else 1.0)
+        aperture = 0.0 if is_there(scene.arm.position, position, turn) else 1.0
+        return np.append(step_towards(scene.arm.position, position, turn), aperture)
 
 
 TASK = BlockPicking
