@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from symview_sim.motions import EXPERT_TURN, MAX_STEP, is_there, nearest_turn, step_towards
+from symview_sim.motions import MAX_STEP, MAX_TURN, nearest_turn, step_towards
 
 
 @pytest.mark.parametrize(
@@ -18,13 +18,10 @@ def test_nearest_turn_changes_sign_in_a_mirror():
         assert nearest_turn(-start, -goal, np.pi / 2) == pytest.approx(-nearest_turn(start, goal, np.pi / 2))
 
 
-def test_a_step_is_clamped():
-    motion = step_towards(np.zeros(3), np.array([0.2, -0.01, 0.0]), turn=2.0)
-    np.testing.assert_allclose(motion, [MAX_STEP, -0.01, 0.0, EXPERT_TURN])
-
-
-@pytest.mark.parametrize(
-    ("offset", "turn", "there"), [((0.009, 0, 0), 0.05, True), ((0, 0, 0.02), 0.0, False), ((0, 0, 0), -0.2, False)]
-)
-def test_a_goal_is_reached_in_position_and_yaw(offset, turn, there):
-    assert is_there(np.zeros(3), np.array(offset), turn) is there
+def test_a_step_is_clamped_and_says_whether_it_arrives():
+    motion, arrives = step_towards(np.zeros(3), np.array([0.2, -0.01, 0.0]), turn=2.0)
+    np.testing.assert_allclose(motion, [MAX_STEP, -0.01, 0.0, MAX_TURN])
+    assert not arrives
+    motion, arrives = step_towards(np.zeros(3), np.array([0.02, -0.01, 0.0]), turn=0.1)
+    np.testing.assert_allclose(motion, [0.02, -0.01, 0.0, 0.1])
+    assert arrives

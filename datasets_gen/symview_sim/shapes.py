@@ -1,0 +1,70 @@
+"""Bodies that no asset package has, built from boxes and cylinders: a bowl, a cabinet and its drawer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+WALL = 0.006  # metres
+# Metres from the cabinet's origin to the handle bar's centre, drawer closed: 6.5 cm before its front, so that a hand three
+# centimetres thick fits between them.
+HANDLE_REACH = 0.170
+BOWL_WALLS = 12  # PyBullet crashes at more than 16 parts
+
+
+@dataclass(frozen=True)
+class Part:
+    """One convex piece of a body, in the body's frame; `euler` are its fixed-axis angles about x, y, z.
+
+    A box has `size` along x, y, z; a cylinder, whose axis is z, has `size` (diameter, diameter, length).
+    """
+
+    size: Vector
+    position: Vector
+    euler: Vector = (0.0, 0.0, 0.0)
+    is_cylinder: bool = False
+
+
+def bowl_parts(floor_radius: float = 0.045, rim_radius: float = 0.075, height: float = 0.062) -> list[Part]:
+    """Return a round floor and twelve slanting walls; origin on the table under the centre, metres."""
+    parts = [Part((2 * floor_radius, 2 * floor_radius, WALL), (0.0, 0.0, WALL / 2), is_cylinder=True)]
+    rise, run = height - WALL / 2, rim_radius - floor_radius
+    slant = np.arctan2(run, rise)
+    length, width = np.hypot(rise, run), 2 * rim_radius * np.tan(np.pi / BOWL_WALLS)
+    for i in range(BOWL_WALLS):
+        angle = 2 * np.pi * i / BOWL_WALLS
+        radius = (floor_radius + rim_radius) / 2
+        position = (radius * np.cos(angle), radius * np.sin(angle), (height + WALL / 2) / 2)
+        parts.append(Part((WALL, width, length), position, (0.0, slant, angle)))
+    return parts
+
+
+def cabinet_parts(depth: float = 0.213, width: float = 0.228, height: float = 0.108) -> list[Part]:
+    """Return the five panels of a cabinet open at -x; origin on the table under its centre."""
+    return [
+        Part((depth, width, WALL), (0.0, 0.0, WALL / 2)),
+        Part((depth, width, WALL), (0.0, 0.0, height - WALL / 2)),
+        Part((depth, WALL, height), (0.0, (width - WALL) / 2, height / 2)),
+        Part((depth, WALL, height), (0.0, -(width - WALL) / 2, height / 2)),
+        Part((WALL, width, height), ((depth - WALL) / 2, 0.0, height / 2)),
+    ]
+
+
+def drawer_parts(side: float = 0.2, height: float = 0.088) -> list[Part]:
+    """Return a drawer's five panels and its handle, a bar on two posts; origin under its centre, as the cabinet's."""
+    middle, front = 0.054, -0.105
+    center = front + side / 2
+    bar = 0.015
+    post = -front - HANDLE_REACH + bar / 2  # negative: from the front to the bar, along -x
+    return [
+        Part((side, side, WALL), (center, 0.0, middle - (height - WALL) / 2)),
+        Part((WALL, side, height), (front + WALL / 2, 0.0, middle)),
+        Part((WALL, side, height), (front + side - WALL / 2, 0.0, middle)),
+        Part((side, WALL, height), (center, (side - WALL) / 2, middle)),
+        Part((side, WALL, height), (center, -(side - WALL) / 2, middle)),
+        Part((bar, 0.1, bar), (-HANDLE_REACH, 0.0, middle)),
+        Part((-post, 0.01, 0.01), (front + post / 2, 0.045, middle)),
+        Part((-post, 0.01, 0.01), (front + post / 2, -0.045, middle)),
+    ]

@@ -1,0 +1,60 @@
+"""Block pulling: bring two flat blocks together."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_symview.camera import Array
+from symview_sim.motions import MAX_STEP, sweep
+from symview_sim.placing import random_places
+from symview_sim.scene import Scene
+from symview_sim.tasks.base import Task
+
+SIZE = (0.08, 0.08, 0.05)
+BEHIND = 0.08  # metres behind the moved block where a sweep starts
+HEIGHT = 0.03
+TOUCHING = 0.002  # metres
+NEAR, GENTLE = 0.06, 0.02  # metres: closer than this to each other, blocks are moved in small steps
+
+
+class BlockPulling(Task):
+    """Two blue flat blocks lie in the workspace; solved when they touch."""
+
+    instruction = "Pull the two blue blocks together."
+
+    def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
+        """Put the blocks down, more than 13.6 cm apart."""
+        places = random_places(rng, scene.workspace, paddings=(0.068, 0.068), distance=0.136)
+        yaws = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
+        self._blocks = [
+            scene.add_box(SIZE, 0.5, 0.5, (0.1, 0.2, 0.9), (*place, SIZE[2] / 2), yaw)
+            for place, yaw in zip(places, yaws, strict=True)
+        ]
+
+    def is_success(self, scene: Scene) -> bool:
+        """Whether the blocks touch, or lie within two millimetres after touching while they moved."""
+        return scene.gap(*self._blocks, longest=0.01) < TOUCHING
+
+    def is_valid(self, scene: Scene) -> bool:
+        """Whether both blocks are where the gripper can reach them."""
+        return all(scene.within_reach(block) for block in self._blocks)
+
+    def expert_action(self, scene: Scene) -> Array:
+        """Sweep, open, through one block's far side to the other: the one there is room behind, else the nearer one.
+
+        The blocks look alike, so which of them moves must follow from where they and the gripper are.
+        """
+        places = [scene.pose(block)[0][:2] for block in self._blocks]
+        options = []
+        for moved, other in (places, places[::-1]):
+            along = (other - moved) / np.linalg.norm(other - moved)
+            behind = moved - BEHIND * along
+            start = scene.clip_to_workspace(behind)
+            lacking = round(float(np.linalg.norm(start - behind)), 2)
+            options.append((lacking, np.linalg.norm(scene.arm.position[:2] - moved), start, other))
+        _, _, start, other = min(options, key=lambda option: option[:2])
+        speed = GENTLE if scene.gap(*self._blocks, longest=NEAR) < NEAR else MAX_STEP
+        return np.append(sweep(scene.arm.position, scene.arm.yaw, start, other, HEIGHT, speed), 1.0)
+
+
+TASK = BlockPulling

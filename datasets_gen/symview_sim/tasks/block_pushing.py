@@ -1,0 +1,50 @@
+"""Block pushing: push a cube onto a painted square."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_symview.camera import Array
+from symview_sim.motions import sweep
+from symview_sim.placing import random_places
+from symview_sim.scene import Scene
+from symview_sim.tasks.base import Task
+
+EDGE = 0.05
+GOAL_EDGE = 0.087
+CLOSE = 0.05  # metres between the cube's centre and the square's
+BEHIND, SHORT = 0.08, 0.035  # metres: where a push starts behind the cube, and ends before the goal
+HEIGHT = 0.03
+
+
+class BlockPushing(Task):
+    """A red cube and a blue square lie in the workspace; solved when the cube's centre is within 5 cm of the square's."""
+
+    instruction = "Push the red block onto the blue square."
+
+    def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
+        """Put the cube and the square down, more than 9 cm apart."""
+        cube, goal = random_places(rng, scene.workspace, paddings=(0.06, 0.065), distance=0.09)
+        yaw = rng.uniform(-np.pi / 2, np.pi / 2)
+        self._cube = scene.add_box((EDGE, EDGE, EDGE), 0.1, 1.0, (0.9, 0.1, 0.1), (*cube, EDGE / 2), yaw)
+        self._goal = goal
+        scene.add_marking(GOAL_EDGE, (0.1, 0.2, 0.9), goal)
+
+    def is_success(self, scene: Scene) -> bool:
+        """Whether the cube is on the square."""
+        return bool(np.linalg.norm(scene.pose(self._cube)[0][:2] - self._goal) < CLOSE)
+
+    def is_valid(self, scene: Scene) -> bool:
+        """Whether the cube is where the gripper can reach it."""
+        return scene.within_reach(self._cube)
+
+    def expert_action(self, scene: Scene) -> Array:
+        """Sweep, half open, along the line from the cube to the square."""
+        cube = scene.pose(self._cube)[0][:2]
+        along = (self._goal - cube) / np.linalg.norm(self._goal - cube)
+        start = scene.clip_to_workspace(cube - BEHIND * along)
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, self._goal - SHORT * along, HEIGHT)
+        return np.append(motion, 0.5)
+
+
+TASK = BlockPushing

@@ -1,0 +1,52 @@
+"""Drawer opening: hook the handle and pull the drawer out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lerobot_symview.camera import Array
+from symview_sim.grasping import CLOSED
+from symview_sim.motions import sweep
+from symview_sim.scene import Scene
+from symview_sim.shapes import HANDLE_REACH, cabinet_parts, drawer_parts
+from symview_sim.tasks.base import Task
+
+OPENED = 0.15  # metres
+TRAVEL = 0.2  # metres: the drawer's end stop
+BEHIND = 0.028  # metres behind the bar's centre at which the fingers go down: the middle of the gap
+PULL = 0.2
+HEIGHT = 0.034
+
+
+class DrawerOpening(Task):
+    """A cabinet with one drawer stands anywhere, turned anyhow; solved when the drawer is 15 cm open."""
+
+    instruction = "Open the drawer."
+
+    def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
+        """Put the cabinet down so that its handle is near the middle, in any direction."""
+        yaw = rng.uniform(0, 2 * np.pi)
+        offset = rng.uniform([0.15, -0.10], [0.20, 0.10])
+        rotation = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        place = np.asarray(scene.workspace.center) + rotation @ offset
+        self._inward = rotation[:, 0]
+        self._cabinet = scene.add_drawer(cabinet_parts(), drawer_parts(), (*place, 0.0), yaw, TRAVEL)
+
+    def is_success(self, scene: Scene) -> bool:
+        """Whether the drawer is open."""
+        return scene.opening(self._cabinet) > OPENED
+
+    def is_valid(self, scene: Scene) -> bool:
+        """Always: the cabinet does not move."""
+        return True
+
+    def expert_action(self, scene: Scene) -> Array:
+        """Go down behind the handle with closed fingers, then pull."""
+        cabinet, _ = scene.pose(self._cabinet)
+        bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * self._inward
+        start = bar + BEHIND * self._inward
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * self._inward, HEIGHT)
+        return np.append(motion, CLOSED)
+
+
+TASK = DrawerOpening
