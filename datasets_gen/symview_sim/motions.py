@@ -31,8 +31,8 @@ def _straight(way: Array, longest: float) -> Array:
 def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, speed: float = MAX_STEP) -> Array:
     """Return the motion (4,) of a sweep along the table from `start` to `end` (2,), approached from above `start`.
 
-    What to do follows from where the gripper is: on the line and low, go on to `end`; above `start`, go down; else go to
-    10 cm above `start`. The fingers' opening axis is kept across the sweep, whose steps are at most `speed` metres.
+    What to do follows from where the gripper is: on the line and low, go on to `end`; above `start`, go down; else go
+    to 10 cm above `start`. The fingers' opening axis is kept across the sweep, whose steps are at most `speed` metres.
     """
     along = (end - start) / np.linalg.norm(end - start)
     turn = nearest_turn(yaw, np.arctan2(along[0], -along[1]), period=np.pi)

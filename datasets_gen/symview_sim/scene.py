@@ -85,7 +85,7 @@ class Scene:
     def add_drawer(
         self, cabinet: Sequence[Part], drawer: Sequence[Part], position: Vector, yaw: float, travel: float
     ) -> int:
-        """Add a fixed cabinet whose drawer slides out along its -x axis by up to `travel` metres; return its body id."""
+        """Add a fixed cabinet whose drawer slides out along -x by up to `travel` metres; return its body id."""
         base_collision, base_visual = self._shapes(cabinet, (0.9, 0.9, 0.88))
         link_collision, link_visual = self._shapes(drawer, (0.35, 0.4, 0.5))
         body = self.client.createMultiBody(

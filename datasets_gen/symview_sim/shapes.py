@@ -8,8 +8,8 @@ import numpy as np
 
 Vector = tuple[float, float, float]
 WALL = 0.006  # metres
-# Metres from the cabinet's origin to the handle bar's centre, drawer closed: 6.5 cm before its front, so that a hand three
-# centimetres thick fits between them.
+# Metres from the cabinet's origin to the handle bar's centre, drawer closed: 6.5 cm before its front, since the hand is
+# six centimetres thick.
 HANDLE_REACH = 0.170
 BOWL_WALLS = 12  # PyBullet crashes at more than 16 parts
 

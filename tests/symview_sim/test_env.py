@@ -25,6 +25,17 @@ sys.stdout.write(digest.hexdigest())
 """
 
 
+# Mean length of the experts' episodes in BulletArm, whose tasks these are.
+REFERENCE_LENGTHS = {
+    "block_in_bowl": 12.7,
+    "block_picking": 7.0,
+    "block_pulling": 8.5,
+    "block_pushing": 9.4,
+    "block_stacking": 13.3,
+    "drawer_opening": 8.7,
+}
+
+
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_gymnasiums_own_checker_is_satisfied(task):
     env = gymnasium.make(gym_id(task)).unwrapped
@@ -60,7 +71,7 @@ def test_environments_in_one_process_do_not_disturb_each_other(task):
 def test_the_expert_succeeds(task):
     env = SymviewEnv(task)
     outcomes, lengths = [], []
-    for seed in range(20):
+    for seed in range(10):
         env.reset(seed=FIRST_SEED + seed)
         done, steps = False, 0
         while not done:
@@ -68,8 +79,8 @@ def test_the_expert_succeeds(task):
             done, steps = terminated or truncated, steps + 1
         outcomes.append(info["is_success"])
         lengths.append(steps)
-    assert sum(outcomes) >= 19
-    assert np.mean(lengths) <= 15
+    assert all(outcomes)
+    assert np.mean(lengths) <= 1.2 * REFERENCE_LENGTHS[task]
 
 
 def test_actions_are_clamped_to_the_stated_limits():

@@ -33,7 +33,7 @@ class BlockPulling(Task):
 
     def is_success(self, scene: Scene) -> bool:
         """Whether the blocks touch, or lie within two millimetres after touching while they moved."""
-        return scene.gap(*self._blocks, longest=0.01) < TOUCHING
+        return scene.gap(self._blocks[0], self._blocks[1], longest=0.01) < TOUCHING
 
     def is_valid(self, scene: Scene) -> bool:
         """Whether both blocks are where the gripper can reach them."""
@@ -53,7 +53,7 @@ class BlockPulling(Task):
             lacking = round(float(np.linalg.norm(start - behind)), 2)
             options.append((lacking, np.linalg.norm(scene.arm.position[:2] - moved), start, other))
         _, _, start, other = min(options, key=lambda option: option[:2])
-        speed = GENTLE if scene.gap(*self._blocks, longest=NEAR) < NEAR else MAX_STEP
+        speed = GENTLE if scene.gap(self._blocks[0], self._blocks[1], longest=NEAR) < NEAR else MAX_STEP
         return np.append(sweep(scene.arm.position, scene.arm.yaw, start, other, HEIGHT, speed), 1.0)
 
 

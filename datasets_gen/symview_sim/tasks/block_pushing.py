@@ -18,7 +18,7 @@ HEIGHT = 0.03
 
 
 class BlockPushing(Task):
-    """A red cube and a blue square lie in the workspace; solved when the cube's centre is within 5 cm of the square's."""
+    """A red cube and a blue square lie in the workspace; solved when their centres are within 5 cm."""
 
     instruction = "Push the red block onto the blue square."
 
