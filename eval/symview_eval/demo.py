@@ -31,9 +31,9 @@ class DemoConfig:
     """Folder for everything; a second run continues what an interrupted one left."""
     demonstrations: int = 100
     """How many expert episodes to learn from."""
-    steps: int = 600
+    steps: int = 1500
     """Training steps."""
-    batch_size: int = 32
+    batch_size: int = 16
     """Frames per training step."""
     eval_episodes: int = 50
     """Episodes of the evaluation."""
@@ -57,7 +57,6 @@ def stages(config: DemoConfig) -> list[Stage]:
         f"--dataset.root={recorded}",
         f"--env.task={TASK}",
         f"--num_episodes={config.demonstrations}",
-        "--noise=0.1",
         f"--seed={config.seed}",
     )
     # Only the views go into the training set: LeRobot decodes every image of a frame, wanted or not.

@@ -21,7 +21,8 @@ from symview_eval.preview import TITLES, frame_images
 from symview_eval.stages import Stage
 from symview_eval.statistics import SuccessRate
 
-LOSS_LINE = re.compile(r"step:(\S+) .*?loss:(\S+)")
+LOSS_LINE = re.compile(r"step:\S+ .*?loss:(\S+)")
+LOG_INTERVAL = re.compile(r"'log_freq': (\d+)")
 MOMENT = 2  # frame of the first demonstration that is shown: the gripper is on its way, the arm in the picture
 SHOWN = ("side", "side_reproj", "side_persp", "top")
 PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "numpy")
@@ -29,20 +30,17 @@ PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "
 
 @dataclass(frozen=True)
 class LossPoint:
-    """Training loss averaged up to `step`."""
+    """Training loss averaged over the steps since the last point, up to `step`."""
 
-    step: float
+    step: int
     loss: float
 
 
 def read_losses(log: Path) -> list[LossPoint]:
-    """Return the losses that `lerobot-train` logged; its step counts may be abbreviated (1K)."""
+    """Return the losses that `lerobot-train` logged, at the interval it logged too: it writes step 1230 as 1K."""
     text = log.read_text(errors="replace")
-    return [LossPoint(_number(step), float(loss)) for step, loss in LOSS_LINE.findall(text)]
-
-
-def _number(text: str) -> float:
-    return float(text[:-1]) * 1000 if text.endswith("K") else float(text)
+    interval = int(LOG_INTERVAL.findall(text)[0])
+    return [LossPoint(interval * (i + 1), float(loss)) for i, loss in enumerate(LOSS_LINE.findall(text))]
 
 
 def read_success(evaluation: Path) -> SuccessRate:

@@ -1,0 +1,172 @@
+"""`symview-benchmark`: what experts achieve and what a simulated step costs, as tables or JSON."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from lerobot_symview.cli import USAGE, DatasetTarget, run_command
+from lerobot_symview.names import lookup
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings
+from symview_sim.tasks import TASK_NAMES
+
+REPEATS = 50
+
+EXAMPLES = """\
+  symview-benchmark experts --seeds=200
+  symview-benchmark env --json=true"""
+
+
+@dataclass(frozen=True)
+class ExpertsBenchmark:
+    """Success and length of the experts' episodes, per task."""
+
+    seeds: int = 200
+    """Episodes per task, from seeds 0 upwards."""
+    tasks: list[str] = field(default_factory=lambda: list(TASK_NAMES))
+    """Which tasks."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
+        for task in self.tasks:
+            lookup("task", task, dict.fromkeys(TASK_NAMES))
+
+
+@dataclass(frozen=True)
+class EnvBenchmark:
+    """Cost of an environment's steps with one camera on one core, medians in milliseconds."""
+
+    env: EnvSettings = field(default_factory=EnvSettings)
+    """What is simulated."""
+    episodes: int = 20
+    """Expert episodes to time."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"--episodes must be at least 1, got {self.episodes}")
+
+
+def benchmark_experts(config: ExpertsBenchmark) -> dict[str, dict[str, float]]:
+    """Return `success` (a rate), `mean_length`, `min_length` and `max_length` per task."""
+    results = {}
+    for task in config.tasks:
+        env = EnvSettings(task=task).make()
+        successes, lengths = 0, []
+        for seed in tqdm(range(config.seeds), desc=task, unit="episode"):
+            env.reset(seed=seed)
+            success, length = _expert_episode(env)
+            successes += success
+            lengths.append(length)
+        env.close()
+        results[task] = {
+            "success": successes / config.seeds,
+            "mean_length": statistics.fmean(lengths),
+            "min_length": min(lengths),
+            "max_length": max(lengths),
+        }
+    return results
+
+
+def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
+    """Return what a step, a reset, a rendering and the motion of a step cost, and episodes per second.
+
+    `episodes_per_s` counts simulated expert episodes, `saved_episodes_per_s` those written to a dataset, start-up of
+    LeRobot's writer included.
+    """
+    from symview_sim.rendering import render
+
+    env = config.env.make()
+    resets, steps = [], []
+    start = time.perf_counter()
+    for seed in tqdm(range(config.episodes), desc=config.env.task, unit="episode"):
+        resets.append(_milliseconds(env.reset, seed=seed))
+        done = False
+        while not done:
+            action = env.expert_action()
+            before = time.perf_counter()
+            _, _, terminated, truncated, _ = env.step(action)
+            steps.append(1000 * (time.perf_counter() - before))
+            done = terminated or truncated
+    simulated = config.episodes / (time.perf_counter() - start)
+    scene, camera = env.scene, next(iter(env.cameras.values()))
+    renders = [_milliseconds(render, scene.client, camera) for _ in range(REPEATS)]
+    motions = [_milliseconds(scene.arm.move, scene.arm.position, scene.arm.yaw, 1.0) for _ in range(REPEATS)]
+    env.close()
+    return {
+        "step_ms": statistics.median(steps),
+        "reset_ms": statistics.median(resets),
+        "render_ms": statistics.median(renders),
+        "physics_ms": statistics.median(motions),
+        "episodes_per_s": simulated,
+        "saved_episodes_per_s": _saved_per_second(config),
+    }
+
+
+def _saved_per_second(config: EnvBenchmark) -> float:
+    import lerobot.datasets  # noqa: F401  imported before the clock starts: it takes longer than the writing
+
+    recorded = RecordedEnv(task=config.env.task, robot=config.env.robot, camera=config.env.camera, oracle=False)
+    with tempfile.TemporaryDirectory() as folder:
+        target = DatasetTarget("benchmark/recorded", Path(folder) / "recorded")
+        start = time.perf_counter()
+        generate(GenerateConfig(target, env=recorded, num_episodes=config.episodes))
+        return config.episodes / (time.perf_counter() - start)
+
+
+def _expert_episode(env: Any) -> tuple[bool, int]:
+    length, done = 0, False
+    while not done:
+        _, _, terminated, truncated, info = env.step(env.expert_action())
+        length, done = length + 1, terminated or truncated
+    return info["is_success"], length
+
+
+def _milliseconds(call: Callable[..., Any], *arguments: Any, **options: Any) -> float:
+    start = time.perf_counter()
+    call(*arguments, **options)
+    return 1000 * (time.perf_counter() - start)
+
+
+def _print(results: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(results) + "\n")
+        return
+    for name, value in results.items():
+        values = value if isinstance(value, dict) else {"": value}
+        cells = "  ".join(f"{label:>11} {number:7.3g}" for label, number in values.items())
+        sys.stdout.write(f"{name:22}{cells}\n")
+
+
+SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
+    "experts": (ExpertsBenchmark, benchmark_experts),
+    "env": (EnvBenchmark, benchmark_env),
+}
+
+
+def main() -> None:
+    """Run the console command: the first argument names the suite."""
+    suite = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else "experts"
+    try:
+        config_class, measure = lookup("suite", suite, SUITES)
+    except ValueError as error:
+        sys.stderr.write(f"symview-benchmark: error: {error}\n")
+        sys.exit(USAGE)
+    sys.argv = [
+        argument.replace("--json", "--json=true") if argument == "--json" else argument for argument in sys.argv
+    ]
+    run_command(config_class, lambda config: _print(measure(config), config.json), EXAMPLES)

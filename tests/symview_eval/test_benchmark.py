@@ -1,0 +1,35 @@
+import json
+
+import pytest
+
+from symview_eval import benchmark
+
+
+def test_experts_are_counted_per_task():
+    results = benchmark.benchmark_experts(benchmark.ExpertsBenchmark(seeds=2, tasks=["block_picking"]))
+    assert results == {"block_picking": {"success": 1.0, "mean_length": 7.0, "min_length": 7, "max_length": 7}}
+
+
+def test_the_environment_benchmark_names_every_cost(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["symview-benchmark", "env", "--episodes=1", "--json"])
+    with pytest.raises(SystemExit) as end:
+        benchmark.main()
+    assert end.value.code == 0
+    results = json.loads(capsys.readouterr().out)
+    assert list(results) == [
+        "step_ms",
+        "reset_ms",
+        "render_ms",
+        "physics_ms",
+        "episodes_per_s",
+        "saved_episodes_per_s",
+    ]
+    assert all(value > 0 for value in results.values())
+
+
+def test_an_unknown_suite_is_answered_with_the_nearest_known_one(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["symview-benchmark", "expert"])
+    with pytest.raises(SystemExit) as end:
+        benchmark.main()
+    assert end.value.code == 2
+    assert "did you mean 'experts'" in capsys.readouterr().err
