@@ -146,5 +146,6 @@ def test_a_preview_is_a_picture(with_views, tmp_path):
         "symview-preview", "--dataset.repo_id=test/v", f"--dataset.root={with_views}", "--frame=3", f"--output={output}"
     )
     assert result.returncode == 0, result.stderr
-    width, height = Image.open(output).size
+    with Image.open(output) as picture:
+        width, height = picture.size
     assert width > 5 * height
