@@ -41,17 +41,19 @@ def render(client: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.f
         shadow=0,
         renderer=pybullet.ER_TINY_RENDERER,
     )
-    shape = (camera.height, camera.width)
-    zbuffer = np.reshape(zbuffer, shape).astype(np.float64)
-    depth = far * near / (far - (far - near) * zbuffer)
     table_rgb, table_depth = _table(camera)
-    body = (np.reshape(mask, shape) >= 0) & ((depth < table_depth) | (table_depth == 0))
-    rgb = np.where(body[..., None], np.reshape(rgba, (*shape, 4))[..., :3].astype(np.uint8), table_rgb)
-    return rgb, np.where(body, depth, table_depth).astype(np.float32)
+    rgb, depth = table_rgb.copy(), table_depth.copy()
+    drawn = np.flatnonzero(np.asarray(mask).ravel() >= 0)  # few pixels: the rest is not touched
+    drawn_depth = far * near / (far - (far - near) * np.asarray(zbuffer).ravel()[drawn].astype(np.float64))
+    behind = depth.ravel()[drawn]
+    visible = (drawn_depth < behind) | (behind == 0)
+    rgb.reshape(-1, 3)[drawn[visible]] = np.reshape(rgba, (-1, 4))[drawn[visible], :3]
+    depth.ravel()[drawn[visible]] = drawn_depth[visible]
+    return rgb, depth
 
 
 @lru_cache(maxsize=16)  # a camera mostly stays where it is
-def _table(camera: Camera) -> tuple[NDArray[np.uint8], Array]:
+def _table(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Colour (H, W, 3) and depth (H, W) of an infinite chequered table; its tiles are symmetric about x = 0.45."""
     rotation, position = camera.world_from_cam[:3, :3], camera.position
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -63,7 +65,7 @@ def _table(camera: Camera) -> tuple[NDArray[np.uint8], Array]:
     xy = position[:2] + depth[..., None] * rays[..., :2]
     tile = np.floor((np.where(hit[..., None], xy, 0.0) - (0.45, 0.0)) / TILE + 0.5).astype(np.int64)
     rgb = np.where(hit[..., None], TILE_COLORS[tile.sum(axis=-1) % 2], SKY)
-    return rgb, np.where(hit, depth, 0.0)
+    return rgb, np.where(hit, depth, 0.0).astype(np.float32)
 
 
 def _projection_matrix(camera: Camera, near: float, far: float) -> Array:

@@ -99,14 +99,18 @@ class Arm:
 
     def move(self, position: ArrayLike, yaw: float, aperture: float) -> None:
         """Move the gripper to `position` (3,), `yaw`, then open it to `aperture` in [0, 1]; always as many steps."""
+        simulate = self._client.stepSimulation
         start = np.array([state[0] for state in self._client.getJointStates(self.body, self._joints)])
         goal = np.array(self._solve(position, yaw))
-        for step in range(1, ARM_STEPS + 1):  # a target that jumps would throw what it hits
-            self._command_arm((start + (goal - start) * min(1.0, step / RAMP_STEPS)).tolist())
-            self._client.stepSimulation()
+        progress = np.arange(1, RAMP_STEPS + 1)[:, None] / RAMP_STEPS
+        for angles in (start + (goal - start) * progress).tolist():  # a target that jumps would throw what it hits
+            self._command_arm(angles)
+            simulate()
+        for _ in range(ARM_STEPS - RAMP_STEPS):
+            simulate()
         self._command_fingers(aperture)
         for _ in range(GRIPPER_STEPS):
-            self._client.stepSimulation()
+            simulate()
 
     @property
     def position(self) -> Array:

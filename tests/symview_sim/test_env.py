@@ -54,6 +54,19 @@ def test_episodes_are_bit_identical_across_processes(task):
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
+def test_an_episode_does_not_depend_on_those_before_it(task):
+    """Workers simulate whichever episodes come next: these must be the same ones (found wrong in Bullet twice)."""
+    ordered, disordered = SymviewEnv(task), SymviewEnv(task)
+    expected = [_expert_states(ordered, seed) for seed in range(5)]
+    rng = np.random.default_rng(0)
+    for seed in (4, 2, 2, 0, 3, 1):
+        disordered.reset(seed=100 + seed)
+        for _ in range(seed):  # an episode broken off
+            disordered.step(rng.uniform(disordered.action_space.low, disordered.action_space.high))
+        np.testing.assert_array_equal(_expert_states(disordered, seed), expected[seed])
+
+
+@pytest.mark.parametrize("task", TASK_NAMES)
 def test_environments_in_one_process_do_not_disturb_each_other(task):
     alone, first, second = (SymviewEnv(task) for _ in range(3))
     expected = [alone.reset(seed=7)[0]["pixels"]["side"]]
@@ -65,6 +78,15 @@ def test_environments_in_one_process_do_not_disturb_each_other(task):
         seen.append(first.step(first.expert_action())[0]["pixels"]["side"])
         second.step(second.expert_action())
     np.testing.assert_array_equal(seen, expected)
+
+
+def _expert_states(env, seed):
+    states, done = [env.reset(seed=seed)[0]["agent_pos"]], False
+    while not done:
+        observation, _, terminated, truncated, _ = env.step(env.expert_action())
+        states.append(observation["agent_pos"])
+        done = terminated or truncated
+    return np.array(states)
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)

@@ -14,7 +14,7 @@ from symview_sim.tasks.base import Task
 OPENED = 0.15  # metres
 TRAVEL = 0.2  # metres: the drawer's end stop
 BEHIND = 0.028  # metres behind the bar's centre at which the fingers go down: the middle of the gap
-PULL = 0.2
+PULL, PULL_SPEED = 0.2, 0.04  # metres, and metres per action: slower than the fingers could
 HEIGHT = 0.034
 
 
@@ -45,7 +45,7 @@ class DrawerOpening(Task):
         cabinet, _ = scene.pose(self._cabinet)
         bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * self._inward
         start = bar + BEHIND * self._inward
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * self._inward, HEIGHT)
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * self._inward, HEIGHT, PULL_SPEED)
         return np.append(motion, CLOSED)
 
 
