@@ -43,9 +43,15 @@ class DatasetTarget:
         return Path(HF_LEROBOT_HOME) / self.repo_id
 
 
-def run_command[Config](config_class: type[Config], main: Callable[[Config], object], examples: str) -> None:
+def run_command[Config](
+    config_class: type[Config],
+    main: Callable[[Config], object],
+    examples: str,
+    short: dict[str, str] | None = None,
+) -> None:
     """Parse the command line into `config_class`, run `main`, and end the process.
 
+    `short` maps abbreviated flags to the full ones.
     Exit codes: 0 done, 2 a flag is wrong, 1 anything else; a user's mistake is one line on stderr.
     """
     import draccus
@@ -56,7 +62,10 @@ def run_command[Config](config_class: type[Config], main: Callable[[Config], obj
 
         sys.stdout.write(f"{program} {version('lerobot_policy_symview')}\n")
         sys.exit(0)
-    _quiet()
+    quiet()
+    for index, argument in enumerate(sys.argv):
+        flag, equals, value = argument.partition("=")
+        sys.argv[index] = (short or {}).get(flag, flag) + equals + value
     if {"-h", "--help"} & set(sys.argv[1:]):
         sys.stdout.write(f"{config_class.__doc__ or ''}\n\nexamples:\n{examples}\n\n")
     complaints = io.StringIO()
@@ -81,7 +90,7 @@ def run_command[Config](config_class: type[Config], main: Callable[[Config], obj
     sys.exit(0)
 
 
-def _quiet() -> None:
+def quiet() -> None:
     """Show our messages and other libraries' errors: their warnings and inner progress bars say nothing to act upon."""
     warnings.simplefilter("ignore")
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")

@@ -24,11 +24,17 @@ def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, 
     return {"dtype": "image", "shape": (height, width, 1), "names": IMAGE_AXES, "info": info}
 
 
-def camera_features(name: str, height: int, width: int, facts: dict[str, Any]) -> Features:
-    """Declare colour, depth and calibration of one RGBD camera."""
-    return {
-        keys.rgb(name): color_feature(height, width, facts),
-        keys.depth(name): metric_feature(height, width, facts),
+def camera_features(
+    name: str, height: int, width: int, facts: dict[str, Any], *, depth: bool = True, segmentation: bool = False
+) -> Features:
+    """Declare colour and calibration of one camera, and its depth and segmentation where it has them."""
+    features = {keys.rgb(name): color_feature(height, width, facts)}
+    if depth:
+        features[keys.depth(name)] = metric_feature(height, width, facts)
+    if segmentation:
+        labels = {"labels": {"0": "table", "1": "robot", "2 and up": "objects"}}
+        features[keys.segmentation(name)] = color_feature(height, width, facts | labels)
+    return features | {
         keys.intrinsics(name): {
             "dtype": "float32",
             "shape": (9,),

@@ -16,6 +16,11 @@ def depth(camera: str) -> str:
     return f"observation.images.{camera}_depth"
 
 
+def segmentation(camera: str) -> str:
+    """uint8 (H, W, 3) label of what a pixel shows, the same in each channel: 0 table, 1 robot, 2 and up objects."""
+    return f"observation.images.{camera}_segmentation"
+
+
 def intrinsics(camera: str) -> str:
     """float32 (9,) K in pixels, row-major."""
     return f"observation.camera.{camera}.intrinsics"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -12,14 +13,15 @@ from lerobot_symview import keys
 from lerobot_symview.camera import Camera
 from lerobot_symview.placement import CameraSpec, top_camera
 from lerobot_symview.workspace import Workspace
+from symview_sim.depth_sensor import degrade
 from symview_sim.motions import MAX_STEP, MAX_TURN
-from symview_sim.rendering import render
+from symview_sim.rendering import Picture, render
 from symview_sim.scene import Scene
 from symview_sim.tasks import make_task
 
 START_HEIGHT = 0.2
 GRIPPER_HEIGHTS = (0.02, 0.25)  # metres the gripper may reach; below 2 cm the fingers touch the table
-RENDER_SIZE = 256
+RENDER_HEIGHT = 256
 
 Observation = dict[str, Any]
 
@@ -28,11 +30,12 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """A tabletop task seen by freely placed RGBD cameras.
 
     Action: (5,) float32 dx, dy, dz (metres, clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in [0, 1].
-    Observation: `pixels[camera]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W) metres;
+    Observation: `pixels[camera]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W) metres, 0 = invalid;
+    `pixels[<camera>_segmentation]` uint8 (H, W, 3), 0 table, 1 robot, 2 and up objects in each channel;
     `camera.<camera>.intrinsics` (9,), `camera.<camera>.world_from_cam` (16,); `agent_pos` (5,) gripper x, y (metres,
     relative to the workspace centre), z, yaw (radians), aperture.
     Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` says so.
-    Start: gripper open, 20 cm above the workspace centre, objects at random.
+    Start: gripper open, 20 cm above the workspace centre, objects at random, cameras anew if they have a spread.
     End: success, an object out of reach, or `max_steps` actions.
 
     Args:
@@ -40,10 +43,15 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         robot: a name in `symview_sim.robots.ROBOTS`.
         cameras: where the cameras stand.
         oracle: adds the camera `top`, which looks straight down and does not see the arm.
+        depth: whether observations hold depth.
+        segmentation: whether observations hold segmentation.
         workspace: the working area.
         start_jitter: largest displacement of the start position per axis, metres.
         max_steps: actions per episode.
         render_mode: `rgb_array` (or None); `render()` returns the first camera's view.
+
+    Raises:
+        ValueError: two cameras of one name, or a camera that does not see the workspace.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 3}  # noqa: RUF012  gymnasium's own form
@@ -54,6 +62,8 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         robot: str = "panda",
         cameras: tuple[CameraSpec, ...] = (CameraSpec(),),
         oracle: bool = False,
+        depth: bool = True,
+        segmentation: bool = False,
         workspace: Workspace | None = None,
         start_jitter: float = 0.0,
         max_steps: int = 50,
@@ -67,15 +77,18 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._max_episode_steps = max_steps
         self._start_jitter = start_jitter
         self._robot = robot
-        specs = (*cameras, top_camera(cameras[0].size, self.workspace)) if oracle else cameras
-        self.cameras = {spec.name: spec.place(self.workspace) for spec in specs}
-        self._sees_robot = {spec.name: spec.sees_robot for spec in specs}
+        self.specs = (*cameras, top_camera(cameras[0].height, self.workspace)) if oracle else tuple(cameras)
+        names = [spec.name for spec in self.specs]
+        if len(set(names)) < len(names):
+            raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
+        self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
+        self._depth, self._segmentation = depth, segmentation
         self._scene: Scene | None = None
         self._steps = 0
         limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
         self._action_low, self._action_high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         self.action_space = gymnasium.spaces.Box(self._action_low, self._action_high)
-        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras))
+        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras, depth, segmentation))
 
     @property
     def scene(self) -> Scene:
@@ -92,6 +105,8 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.scene.reset(np.array([*self.workspace.center, START_HEIGHT]) + jitter, gripper_yaw=0.0)
         self._task.spawn(self.scene, self.np_random)
         self.scene.settle()
+        pose_rng, self._sensor_rng = self.np_random.spawn(2)  # what is seen does not change what happens
+        self.cameras |= {spec.name: spec.place(self.workspace, pose_rng) for spec in self.specs if spec.varies}
         return self._observe(), {"is_success": False}
 
     def step(self, action: NDArray[np.floating]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -113,12 +128,13 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._task.expert_action(self.scene).astype(np.float32)
 
     def render(self) -> NDArray[np.uint8]:
-        """Return the first camera's view, uint8 (256, 256, 3)."""
+        """Return the first camera's view, uint8, 256 rows."""
         camera = next(iter(self.cameras.values()))
-        scale = RENDER_SIZE / camera.height
+        scale = RENDER_HEIGHT / camera.height
         intrinsics = camera.intrinsics * [[scale], [scale], [1]]
-        intrinsics[:2, 2] = (RENDER_SIZE - 1) / 2
-        return render(self.scene.client, Camera(intrinsics, camera.world_from_cam, RENDER_SIZE, RENDER_SIZE))[0]
+        intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
+        width = round(scale * camera.width)
+        return render(self.scene.client, Camera(intrinsics, camera.world_from_cam, RENDER_HEIGHT, width)).rgb
 
     def close(self) -> None:
         """Shut the simulator down."""
@@ -133,19 +149,26 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "agent_pos": np.array([*position, arm.yaw, arm.aperture], dtype=np.float32),
             "pixels": {},
         }
-        for name, camera in self.cameras.items():
-            rgb, depth = self._render(name, camera)
-            observation["pixels"][name] = rgb
-            observation[_env_key(keys.depth(name))] = depth[None]
+        for spec in self.specs:
+            name, camera = spec.name, self.cameras[spec.name]
+            picture = self._picture(spec)
+            observation["pixels"][name] = picture.rgb
+            if self._depth:
+                observation[_env_key(keys.depth(name))] = picture.depth[None]
+            if self._segmentation:
+                labels = np.repeat(picture.labels[..., None], 3, axis=-1)
+                observation["pixels"][_camera_name(keys.segmentation(name))] = labels
             observation[_env_key(keys.intrinsics(name))] = camera.intrinsics.ravel().astype(np.float32)
             observation[_env_key(keys.world_from_cam(name))] = camera.world_from_cam.ravel().astype(np.float32)
         return observation
 
-    def _render(self, name: str, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        if self._sees_robot[name]:
-            return render(self.scene.client, camera)
-        with self.scene.arm.hidden():
-            return render(self.scene.client, camera)
+    def _picture(self, spec: CameraSpec) -> Picture:
+        camera = self.cameras[spec.name]
+        with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
+            picture = render(self.scene.client, camera)
+        if spec.depth_noise == spec.depth_dropout == 0:
+            return picture
+        return picture._replace(depth=degrade(picture.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
 
 
 def _env_key(key: str) -> str:
@@ -153,16 +176,22 @@ def _env_key(key: str) -> str:
     return key.removeprefix("observation.")
 
 
-def _observation_spaces(cameras: dict[str, Camera]) -> dict[str, gymnasium.Space[Any]]:
+def _camera_name(key: str) -> str:
+    """Name under `pixels` that LeRobot turns into `key`, which it does by prefixing `observation.images.`."""
+    return key.removeprefix("observation.images.")
+
+
+def _observation_spaces(cameras: dict[str, Camera], depth: bool, segmentation: bool) -> dict[str, gymnasium.Space[Any]]:
     box = gymnasium.spaces.Box
-    spaces: dict[str, gymnasium.Space[Any]] = {
-        "agent_pos": box(-np.inf, np.inf, (len(keys.STATE_NAMES),), np.float32),
-        "pixels": gymnasium.spaces.Dict(
-            {name: box(0, 255, (camera.height, camera.width, 3), np.uint8) for name, camera in cameras.items()}
-        ),
-    }
+    pixels: dict[str, gymnasium.Space[Any]] = {}
+    spaces: dict[str, gymnasium.Space[Any]] = {"agent_pos": box(-np.inf, np.inf, (len(keys.STATE_NAMES),), np.float32)}
     for name, camera in cameras.items():
-        spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, camera.height, camera.width), np.float32)
+        shape = (camera.height, camera.width)
+        pixels[name] = box(0, 255, (*shape, 3), np.uint8)
+        if segmentation:
+            pixels[_camera_name(keys.segmentation(name))] = box(0, 255, (*shape, 3), np.uint8)
+        if depth:
+            spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, *shape), np.float32)
         spaces[_env_key(keys.intrinsics(name))] = box(-np.inf, np.inf, (9,), np.float32)
         spaces[_env_key(keys.world_from_cam(name))] = box(-np.inf, np.inf, (16,), np.float32)
-    return spaces
+    return spaces | {"pixels": gymnasium.spaces.Dict(pixels)}

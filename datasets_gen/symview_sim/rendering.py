@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,21 @@ TILE_COLORS = np.array([[206, 200, 190], [188, 182, 172]], dtype=np.uint8)
 SKY = np.array([235, 240, 245], dtype=np.uint8)
 
 
-def render(client: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+class Picture(NamedTuple):
+    """What one camera sees.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth: (H, W) float32, metres along the optical axis, 0 above the horizon.
+        labels: (H, W) uint8, 0 where the table or nothing is seen, else the body's place in the order of loading.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    labels: NDArray[np.uint8]
+
+
+def render(client: Any, camera: Camera) -> Picture:
     """Render a scene that stands on the table z = 0.
 
     Bodies are drawn by PyBullet's software renderer; the table is computed per pixel, which is exact and costs a third
@@ -26,9 +40,6 @@ def render(client: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.f
     Args:
         client: PyBullet client whose ground body is invisible.
         camera: where to look from.
-
-    Returns:
-        rgb (H, W, 3) uint8 and depth (H, W) float32, metres along the optical axis, 0 above the horizon.
     """
     near, far = NEAR, FAR
     if camera.position[2] > FAR:  # a distant camera spends its depth range on the scene
@@ -43,13 +54,18 @@ def render(client: Any, camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.f
     )
     table_rgb, table_depth = _table(camera)
     rgb, depth = table_rgb.copy(), table_depth.copy()
-    drawn = np.flatnonzero(np.asarray(mask).ravel() >= 0)  # few pixels: the rest is not touched
+    body = np.asarray(mask).ravel()
+    drawn = np.flatnonzero(body >= 0)  # few pixels: the rest is not touched
     drawn_depth = far * near / (far - (far - near) * np.asarray(zbuffer).ravel()[drawn].astype(np.float64))
     behind = depth.ravel()[drawn]
-    visible = (drawn_depth < behind) | (behind == 0)
-    rgb.reshape(-1, 3)[drawn[visible]] = np.reshape(rgba, (-1, 4))[drawn[visible], :3]
-    depth.ravel()[drawn[visible]] = drawn_depth[visible]
-    return rgb, depth
+    nearer = (drawn_depth < behind) | (behind == 0)
+    drawn, drawn_depth = drawn[nearer], drawn_depth[nearer]
+    rgb.reshape(-1, 3)[drawn] = np.reshape(rgba, (-1, 4))[drawn, :3]
+    depth.ravel()[drawn] = drawn_depth
+    labels = np.zeros(depth.shape, dtype=np.uint8)
+    loaded = [client.getBodyUniqueId(index) for index in range(client.getNumBodies())]
+    labels.ravel()[drawn] = np.searchsorted(loaded, body[drawn])
+    return Picture(rgb, depth, labels)
 
 
 @lru_cache(maxsize=16)  # a camera mostly stays where it is

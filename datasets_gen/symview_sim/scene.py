@@ -45,8 +45,8 @@ class Scene:
         self.client.changeVisualShape(ground, -1, rgbaColor=[1, 1, 1, 0])
         self.arm = Arm(self.client, lookup("robot", robot, ROBOTS))
         self._fixtures: int = self.client.getNumBodies()
-        # The first step ever taken leaves traces in the solver. With it behind, every episode starts from the same state
-        # and is bit-identical in whichever order episodes are simulated (test_env.py).
+        # The first step ever taken leaves traces in the solver. With it behind, episodes are bit-identical in whichever
+        # order they are simulated (test_env.py).
         self.client.stepSimulation()
 
     def reset(self, gripper_position: Array, gripper_yaw: float) -> None:

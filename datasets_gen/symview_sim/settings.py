@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """A task, an arm and a camera."""
+    """A task, an arm and what is seen of them."""
 
     task: str = "block_picking"
     """Which task."""
@@ -23,8 +23,14 @@ class EnvSettings:
     """Which arm."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """Where the camera stands."""
+    more_cameras: tuple[CameraSpec, ...] = ()
+    """Further cameras, such as `[{name: left, azimuth_deg: 90}]`."""
     oracle: bool = False
     """Add the camera `top`, which looks straight down and does not see the arm."""
+    depth: bool = True
+    """Record depth."""
+    segmentation: bool = False
+    """Record which pixel shows table, robot or which object."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
     max_steps: int = 50
@@ -44,8 +50,10 @@ class EnvSettings:
         return SymviewEnv(
             self.task,
             robot=self.robot,
-            cameras=(self.camera,),
+            cameras=(self.camera, *self.more_cameras),
             oracle=self.oracle,
+            depth=self.depth,
+            segmentation=self.segmentation,
             start_jitter=self.start_jitter,
             max_steps=self.max_steps,
         )

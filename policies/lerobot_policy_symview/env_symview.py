@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
@@ -16,24 +17,33 @@ from lerobot_symview import keys
 from lerobot_symview.placement import CameraSpec
 from lerobot_symview.views import make_view
 
+# What a simulator process imports; loaded once by the fork server instead of six seconds in each process.
+PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
+
 
 @EnvConfig.register_subclass("symview")
 @dataclass
 class SymviewEnvConfig(EnvConfig):
-    """PyBullet tabletop tasks seen by a freely placed RGBD camera."""
+    """PyBullet tabletop tasks seen by freely placed RGBD cameras."""
 
     task: str = "block_picking"
-    """Which task, such as `block_picking`."""
+    """Which task, such as `block_picking`; several with commas between them, or `all`."""
     fps: int = 3
     """Actions per second of a robot that takes as long as the simulated one."""
     robot: str = "panda"
-    """Which arm."""
+    """Which arm, `panda` or `kuka`."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """Where the camera stands and what it sees."""
+    more_cameras: tuple[CameraSpec, ...] = ()
+    """Further cameras, such as `[{name: left, azimuth_deg: 90}]`."""
     oracle: bool = False
     """Add the camera `top`, which looks straight down and does not see the arm."""
+    depth: bool = True
+    """Observe depth."""
+    segmentation: bool = False
+    """Observe which pixel shows table, robot or which object."""
     views: list[str] = field(default_factory=list)
-    """Views to add to each observation, for policies that do not compute their own."""
+    """Views of the first camera to add to each observation, for policies that do not compute their own."""
     view_size: int = 152
     """Rows and columns of those views."""
     start_jitter: float = 0.0
@@ -42,13 +52,23 @@ class SymviewEnvConfig(EnvConfig):
     """Actions per episode."""
 
     def __post_init__(self) -> None:
-        names = [self.camera.name, *(["top"] if self.oracle else [])]
-        shapes = {keys.rgb(name): (self.camera.size, self.camera.size, 3) for name in names}
-        shapes |= {keys.depth(name): (self.camera.size, self.camera.size, 1) for name in names}
-        for view in self.views:
-            for output, kind in make_view(view, size=self.view_size).outputs.items():
-                key = keys.view(self.camera.name, output)
-                shapes[key] = (self.view_size, self.view_size, 3 if kind == "rgb" else 1)
+        cameras = [self.camera, *self.more_cameras]
+        sizes = {camera.name: (camera.height, camera.width) for camera in cameras}
+        if self.oracle:
+            sizes["top"] = (self.camera.height, self.camera.height)
+        shapes: dict[str, tuple[int, ...]] = {}
+        for name, size in sizes.items():
+            shapes[keys.rgb(name)] = (*size, 3)
+            if self.depth:
+                shapes[keys.depth(name)] = (*size, 1)
+            if self.segmentation:
+                shapes[keys.segmentation(name)] = (*size, 3)
+        for name in self.views:
+            view = make_view(name, size=self.view_size)
+            if view.needs_depth and not self.depth:
+                raise ValueError(f"the view {name!r} needs depth: leave --env.depth=true or use 'persp'")
+            for output, kind in view.outputs.items():
+                shapes[keys.view(self.camera.name, output)] = (view.size, view.size, 3 if kind == "rgb" else 1)
         self.features = {
             keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),)),
             keys.STATE: PolicyFeature(FeatureType.STATE, (len(keys.STATE_NAMES),)),
@@ -58,24 +78,38 @@ class SymviewEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Settings of the simulated environment, see `symview_sim.settings.EnvSettings`."""
-        names = ("task", "robot", "camera", "oracle", "start_jitter", "max_steps")
+        """Settings of every simulated environment but its task, see `symview_sim.settings.EnvSettings`."""
+        names = (
+            "robot", "camera", "more_cameras", "oracle", "depth", "segmentation", "start_jitter", "max_steps",
+        )  # fmt: skip
         return {name: getattr(self, name) for name in names}
+
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the tasks."""
+        from symview_sim.tasks import TASK_NAMES
+
+        return list(TASK_NAMES) if self.task == "all" else [name.strip() for name in self.task.split(",")]
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
-        """Return `{"symview": {0: a vector environment of n_envs}}`; asynchronous only where it has several."""
+        """Return `{task: {0: a vector environment of n_envs}}`.
+
+        Asynchronous ones, only where there are several, start their processes when they are first reset, so that a
+        suite never runs more than one task's.
+        """
         from symview_sim.settings import EnvSettings
 
+        settings = {task: EnvSettings(task=task, **self.gym_kwargs) for task in self.tasks}
+        if not use_async_envs or n_envs == 1:
+            return {
+                task: {0: gymnasium.vector.SyncVectorEnv([freeze_after_episode_end(one.make)] * n_envs)}
+                for task, one in settings.items()
+            }
+        multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
         # A bound method of plain settings: simulator processes unpickle it without importing LeRobot's registries.
-        make_one = freeze_after_episode_end(EnvSettings(**self.gym_kwargs).make)
-        vector: gymnasium.vector.VectorEnv
-        if use_async_envs and n_envs > 1:
-            vector = gymnasium.vector.AsyncVectorEnv([make_one] * n_envs, context="forkserver")
-        else:
-            vector = gymnasium.vector.SyncVectorEnv([make_one] * n_envs)
-        return {self.type: {0: vector}}
+        return {task: {0: _LazyAsyncVectorEnv([one.make] * n_envs)} for task, one in settings.items()}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Return the pipeline that adds `views`, and the identity for actions."""

@@ -6,7 +6,8 @@ from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.placement import CameraSpec
 from symview_sim.env import SymviewEnv
-from symview_sim.generate import FIRST_SEED, GenerateConfig, RecordedEnv, generate
+from symview_sim.demonstration import episode_seed
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from tests.conftest import EPISODES
 
 
@@ -15,7 +16,7 @@ def test_the_dataset_holds_what_the_environment_showed(recorded):
     env = SymviewEnv("block_picking", oracle=True)
     index = 0
     for episode in range(EPISODES):
-        observation, _ = env.reset(seed=FIRST_SEED + episode)
+        observation, _ = env.reset(seed=episode_seed(0, episode))
         done = False
         while not done:
             item = dataset[index]
@@ -47,7 +48,7 @@ def test_every_episode_ends_in_success(recorded):
 
 
 def test_the_camera_is_a_choice(tmp_path):
-    camera = CameraSpec(name="front", size=64, elevation_deg=30.0, azimuth_deg=20.0)
+    camera = CameraSpec(name="front", height=64, width=80, elevation_deg=30.0, azimuth_deg=20.0)
     target = DatasetTarget("test/front", tmp_path / "front")
     folder = generate(GenerateConfig(target, RecordedEnv(camera=camera, oracle=False), num_episodes=1))
     dataset = LeRobotDataset("test/front", root=folder)

@@ -24,7 +24,7 @@ def test_depth_unprojects_to_the_known_surfaces(scene, elevation, azimuth):
     """A half-pixel error in the renderer's pixel centres shows as 0.6 mm or more here."""
     camera = make_camera(elevation, azimuth)
     with scene.arm.hidden():
-        rgb, depth = render(scene.client, camera)
+        rgb, depth, _ = render(scene.client, camera)
     points = unproject(depth, camera)
     inside = (np.abs(points[..., :2] - [0.45, 0.0]) < BOX[:2] / 2 - 0.01).all(axis=-1)
     top = inside & (np.abs(points[..., 2] - 0.04) < 0.01)

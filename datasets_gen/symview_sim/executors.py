@@ -1,0 +1,142 @@
+"""Where work runs: in this process, in several, or on a Ray cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import wait
+from types import TracebackType
+from typing import Protocol, Self
+
+from lerobot_symview.cli import CommandError, quiet
+from lerobot_symview.names import lookup
+
+
+class Executor(Protocol):
+    """Runs functions that can be pickled; a context manager."""
+
+    def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
+        """Yield `function(argument)` for every argument, in the order in which they are done."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+class SerialExecutor:
+    """Runs everything here, one after the other."""
+
+    def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
+        """Yield the results in order."""
+        yield from map(function, arguments)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+class ProcessExecutor:
+    """Runs in processes of this machine, forked from a server that imports what they need once.
+
+    Args:
+        num_workers: how many processes.
+        preload: modules the server imports; a LeRobot import takes seconds.
+    """
+
+    def __init__(self, num_workers: int, preload: list[str]):
+        context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload(preload)
+        self._pool = ProcessPoolExecutor(num_workers, mp_context=context, initializer=_start_worker)
+        self._pool.submit(os.getpid)  # starts the server, which imports while this process goes on
+
+    def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
+        """Yield the results as they come.
+
+        Raises:
+            CommandError: if a process dies.
+        """
+        try:
+            for future in as_completed([self._pool.submit(function, argument) for argument in arguments]):
+                yield future.result()
+        except BrokenProcessPool:
+            raise CommandError(
+                "a worker process died, perhaps for lack of memory: repeat the command with --resume=true "
+                "and a smaller --num_workers"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+class RayExecutor:
+    """Runs on the Ray cluster that `RAY_ADDRESS` names, or on a local one.
+
+    The cluster's machines must see the same folders and have this package installed.
+
+    Args:
+        num_workers: processes of a local cluster.
+    """
+
+    def __init__(self, num_workers: int):
+        try:
+            import ray
+        except ImportError:
+            raise CommandError(
+                "--executor=ray needs Ray: install the extra with `pip install 'lerobot_policy_symview[ray]'`"
+            ) from None
+        self._ray = ray
+        local = None if "RAY_ADDRESS" in os.environ else num_workers
+        ray.init(num_cpus=local, include_dashboard=False, log_to_driver=False, logging_level="error")
+
+    def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
+        """Yield the results as they come; Ray repeats what a lost worker had begun."""
+        task = self._ray.remote(lambda argument: function(argument))
+        pending = [task.remote(argument) for argument in arguments]
+        try:
+            while pending:
+                done, pending = self._ray.wait(pending)
+                yield self._ray.get(done[0])
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ray.shutdown()
+
+
+def make_executor(kind: str, num_workers: int, preload: list[str]) -> Executor:
+    """Return the executor `kind` (`local` or `ray`) with `num_workers` processes."""
+    makers: dict[str, Callable[[], Executor]] = {
+        "local": lambda: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers, preload),
+        "ray": lambda: RayExecutor(num_workers),
+    }
+    return lookup("executor", kind, makers)()
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent, and end when it does: a worker whose parent is killed would wait for ever."""
+    quiet()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()

@@ -1,0 +1,210 @@
+"""A recording in progress: a folder of finished episodes, the shards made from them, and the dataset made from those.
+
+    <target>.partial/recording.json     what is recorded; a resumed run must ask for the same
+    <target>.partial/episodes/*.npz     an episode each, complete or absent
+    <target>.partial/shards/*           LeRobot datasets of neighbouring episodes, complete or absent
+    <target>.partial/dataset            the shards aggregated, moved to <target> in the end
+
+Nothing in it depends on who simulated which episode when, so any number of workers write the same data, and a process
+killed at any moment loses the episodes it was simulating and no others.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_symview.cli import CommandError
+from lerobot_symview.features import Features
+from symview_sim.demonstration import Episode, demonstrate
+from symview_sim.settings import EnvSettings
+
+SHARD_EPISODES, MAX_SHARDS = 25, 32
+ATTEMPTS_KEY = "attempts"
+MAX_VIDEO_DEPTH = 1.6  # metres: with 12 bits, steps of 0.39 mm and errors of at most 0.2 mm
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is recorded and where; small enough to send to every worker."""
+
+    folder: Path
+    """`<target>.partial`."""
+    repo_id: str
+    env: EnvSettings
+    instruction: str
+    fps: int
+    features: Features
+    seed: int
+    noise: float
+    num_episodes: int
+    video: bool
+
+    def episode_file(self, episode: int) -> Path:
+        """Where an episode is kept."""
+        return self.folder / "episodes" / f"{episode:06d}.npz"
+
+    def shards(self) -> list[range]:
+        """Return the episodes of every shard: 25 or more each, at most 32 shards, whoever writes them."""
+        size = max(SHARD_EPISODES, -(-self.num_episodes // MAX_SHARDS))
+        return [range(first, min(first + size, self.num_episodes)) for first in range(0, self.num_episodes, size)]
+
+    def shard_folder(self, shard: range) -> Path:
+        """Where a shard is kept."""
+        return self.folder / "shards" / f"{shard.start:06d}"
+
+    def description(self) -> dict[str, Any]:
+        """What determines the data, as JSON holds it."""
+        content = asdict(self)
+        del content["folder"]
+        return json.loads(json.dumps(content))
+
+
+def record_episode(recording: Recording, episode: int) -> int:
+    """Simulate an episode and keep it; return how many attempts it took."""
+    frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
+    file = recording.episode_file(episode)
+    part = file.with_suffix(".part")
+    with _disk_errors(recording.folder):
+        with part.open("wb") as stream:
+            np.savez(stream, allow_pickle=False, **frames, **{ATTEMPTS_KEY: attempts})
+        part.replace(file)
+    return attempts
+
+
+def recorded_attempts(recording: Recording) -> dict[int, int]:
+    """Return the attempts that each episode kept so far took, by episode."""
+    attempts = {}
+    for file in sorted((recording.folder / "episodes").glob("*.npz")):
+        with np.load(file) as content:
+            attempts[int(file.stem)] = int(content[ATTEMPTS_KEY])
+    return attempts
+
+
+def write_shard(recording: Recording, shard: range) -> Path:
+    """Write the LeRobot dataset of a shard's episodes, unless it is there, and return its folder."""
+    folder = recording.shard_folder(shard)
+    if folder.exists():
+        return folder
+    part = folder.with_suffix(".part")
+    if part.exists():
+        shutil.rmtree(part)
+    with _disk_errors(recording.folder), _failed_images() as failures:
+        dataset = _create_dataset(recording, part)
+        for episode in shard:
+            for frame in _frames(recording.episode_file(episode)):
+                dataset.add_frame(frame | {"task": recording.instruction})
+                if failures:
+                    raise OSError(failures[0])
+            dataset.save_episode(parallel_encoding=False)
+        dataset.finalize()
+        shutil.rmtree(part / "images")  # LeRobot leaves its empty scratch folders behind
+        part.rename(folder)
+    return folder
+
+
+def join_shards(recording: Recording, shards: list[Path]) -> Path:
+    """Aggregate the shards to one dataset, complete its metadata, and return its folder."""
+    from lerobot.datasets import aggregate_datasets
+
+    joined = recording.folder / "dataset"
+    if joined.exists():
+        shutil.rmtree(joined)
+    attempts = recorded_attempts(recording)
+    with _disk_errors(recording.folder):
+        if len(shards) == 1:
+            shards[0].rename(joined)
+        else:
+            with redirect_stderr(io.StringIO()):  # its progress bars
+                aggregate_datasets(
+                    [recording.repo_id] * len(shards),
+                    recording.repo_id,
+                    roots=shards,
+                    aggr_root=joined,
+                    concatenate_data=False,
+                    concatenate_videos=False,
+                )
+        _state_success_rate(joined, len(attempts) / sum(attempts.values()))
+        (joined / "meta" / "symview_recording.json").write_text(json.dumps(recording.description(), indent=4))
+    return joined
+
+
+def _create_dataset(recording: Recording, root: Path) -> Any:
+    from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
+
+    lossless = {"x265-params": "lossless=1:log-level=none"}
+    encoders = {
+        "rgb_encoder": RGBEncoderConfig(vcodec="hevc", pix_fmt="gbrp", crf=None, extra_options=lossless),
+        "depth_encoder": DepthEncoderConfig(
+            vcodec="hevc",
+            pix_fmt="gray12le",
+            extra_options=lossless,
+            depth_min=0.0,  # keeps 0, which says that nothing was measured
+            depth_max=MAX_VIDEO_DEPTH,
+            use_log=False,
+        ),
+    }
+    return LeRobotDataset.create(
+        recording.repo_id,
+        fps=recording.fps,
+        features={key: dict(feature) for key, feature in recording.features.items()},
+        root=root,
+        robot_type=recording.env.robot,
+        use_videos=recording.video,
+        **(encoders if recording.video else {}),
+    )
+
+
+def _frames(file: Path) -> Iterator[Episode]:
+    with np.load(file) as content:
+        episode = {key: content[key] for key in content.files if key != ATTEMPTS_KEY}
+    for index in range(len(next(iter(episode.values())))):
+        yield {key: values[index] for key, values in episode.items()}
+
+
+def _state_success_rate(dataset: Path, rate: float) -> None:
+    """Complete the facts of every camera's features."""
+    file = dataset / "meta" / "info.json"
+    content = json.loads(file.read_text())
+    for feature in content["features"].values():
+        facts = (feature.get("info") or {}).get("symview")
+        if facts is not None:
+            facts["expert_success_rate"] = rate
+    file.write_text(json.dumps(content, indent=4))
+
+
+@contextmanager
+def _failed_images() -> Iterator[list[str]]:
+    """Yield a list to which every failure is added that LeRobot's image writer, which goes on regardless, only logs."""
+    failures: list[str] = []
+    handler = logging.Handler(logging.ERROR)
+    handler.emit = lambda record: failures.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("lerobot.datasets.image_writer")
+    logger.addHandler(handler)
+    try:
+        yield failures
+    finally:
+        logger.removeHandler(handler)
+
+
+@contextmanager
+def _disk_errors(folder: Path) -> Iterator[None]:
+    """Say what to do when nothing more can be written."""
+    try:
+        yield
+    except OSError as error:
+        free = shutil.disk_usage(folder).free / 2**20
+        raise CommandError(
+            f"cannot write to {folder} ({free:.0f} MiB free): {error}. "
+            "Make room and repeat the command with --resume=true: what is finished is kept"
+        ) from None
