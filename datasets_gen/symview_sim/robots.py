@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from lerobot_symview.camera import Array
 from symview_sim.bullet import pybullet
+from symview_sim.motions import nearest_turn
 
 ARM_STEPS, GRIPPER_STEPS = 60, 25  # simulation steps at 1/240 s: 0.35 s an action
 RAMP_STEPS = 40  # of the arm's steps, in which its target moves to the goal; it settles in the others
@@ -20,6 +22,7 @@ POSITION_GAIN = 0.2
 # askew stays so, at 0.2 it slips out.
 FINGER_FRICTION = 0.3
 IK_ITERATIONS, IK_RESIDUAL = 200, 1e-6
+IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion
 
 
 @dataclass(frozen=True)
@@ -27,43 +30,76 @@ class RobotSpec:
     """What distinguishes one robot model from another; asset paths are those of `pybullet_data`.
 
     Args:
-        urdf: model file.
-        base: position of the base, metres.
+        model: model file, URDF or SDF.
+        base: where the model's origin stands, metres.
         home: joint angles of the arm that start the search for a posture, rad.
-        hand_link: link whose frame is the point between the fingertips.
-        finger_links: the two finger links, whose joints move by up to `finger_travel` metres each.
+        hand_link: last link of the arm, whose z axis is the gripper's direction.
+        finger_links: links of either finger that grip.
+        gripper_joints: all other joints, by index: position when closed and when open (metres or rad), motor limit
+            (N or N m).
         finger_yaw: angle from the fingers' opening axis to the hand frame's x axis, rad.
         arm_force: motor limit of an arm joint, N m.
-        finger_force: motor limit of a finger, N.
-        color: RGBA of the arm; the fingers are drawn darker.
+        hand_from_tool: the point between the fingertips in the hand's frame, metres.
+        joint_limits: lower and upper limits that replace the model's, by joint, rad.
+        color: RGBA of the arm; the gripper is drawn in `finger_color`.
     """
 
-    urdf: str
+    model: str
     base: tuple[float, float, float]
     home: tuple[float, ...]
     hand_link: int
-    finger_links: tuple[int, int]
-    finger_travel: float
+    finger_links: tuple[tuple[int, ...], tuple[int, ...]]
+    gripper_joints: dict[int, tuple[float, float, float]]
     finger_yaw: float
     arm_force: float
-    finger_force: float
+    hand_from_tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    joint_limits: dict[int, tuple[float, float]] = field(default_factory=dict)
     color: tuple[float, float, float, float] = (0.93, 0.93, 0.95, 1.0)
     finger_color: tuple[float, float, float, float] = (0.25, 0.25, 0.28, 1.0)
 
 
 ROBOTS = {
     "panda": RobotSpec(
-        urdf="franka_panda/panda.urdf",
+        model="franka_panda/panda.urdf",
         base=(-0.1, 0.0, 0.0),
         home=(0.0, 0.1, 0.0, -2.2, 0.0, 2.3, 0.785),
         hand_link=11,
-        finger_links=(9, 10),
-        finger_travel=0.04,
+        finger_links=((9,), (10,)),
+        gripper_joints=dict.fromkeys((9, 10), (0.0, 0.04, 10.0)),
         finger_yaw=np.pi / 2,
         arm_force=240.0,
-        finger_force=10.0,
+    ),
+    "kuka": RobotSpec(
+        model="kuka_iiwa/kuka_with_gripper2.sdf",
+        base=(-0.1, 0.0, 0.0),
+        home=(0.0, 0.6, 0.0, -1.6, 0.0, 0.95, 0.0),
+        hand_link=6,
+        finger_links=((9, 10), (12, 13)),
+        # Joint 7 only holds the gripper. The tips (10, 13) are parallel when open and when closed on 5 cm.
+        gripper_joints={
+            7: (0.0, 0.0, 100.0),
+            8: (0.045, -0.195, 2.5),
+            10: (-0.078, 0.025, 2.0),
+            11: (-0.045, 0.195, 2.5),
+            13: (0.078, -0.025, 2.0),
+        },
+        finger_yaw=np.pi,
+        arm_force=240.0,
+        hand_from_tool=(0.0, 0.022, 0.267),
+        joint_limits={3: (-2.4, 2.4)},  # the model's 120 degrees keep the gripper from the workspace's near edge
     ),
 }
+
+
+def _load(client: Any, spec: RobotSpec) -> int:
+    """Load a robot with its base fixed; return its body id."""
+    if spec.model.endswith(".sdf"):
+        (body,) = client.loadSDF(spec.model)
+        center_of_mass, _ = client.getBasePositionAndOrientation(body)
+        client.resetBasePositionAndOrientation(body, np.add(center_of_mass, spec.base).tolist(), IDENTITY)
+        return int(body)
+    # The collision meshes are drawn in place of the visual ones: 3.5k triangles for 100k, nine tenths of the time.
+    return int(client.loadURDF(spec.model, spec.base, useFixedBase=True, flags=pybullet.URDF_IGNORE_VISUAL_SHAPES))
 
 
 class Arm:
@@ -72,10 +108,13 @@ class Arm:
     def __init__(self, client: Any, spec: RobotSpec):
         self._client = client
         self._spec = spec
-        # The collision meshes are drawn in place of the visual ones: 3.5k triangles for 100k, nine tenths of the time.
-        self.body = client.loadURDF(spec.urdf, spec.base, useFixedBase=True, flags=pybullet.URDF_IGNORE_VISUAL_SHAPES)
+        self.body = _load(client, spec)
         self._joints = list(range(len(spec.home)))
-        for finger in spec.finger_links:
+        self._gripper_joints = list(spec.gripper_joints)
+        self._closed, self._open, self._gripper_forces = np.array(list(spec.gripper_joints.values())).T
+        for joint, (lower, upper) in spec.joint_limits.items():
+            client.changeDynamics(self.body, joint, jointLowerLimit=lower, jointUpperLimit=upper)
+        for finger in chain(*spec.finger_links):
             client.changeDynamics(
                 self.body,
                 finger,
@@ -84,14 +123,15 @@ class Arm:
                 contactStiffness=3e4,
                 contactDamping=1e3,
             )
+        self._wrist_limits = client.getJointInfo(self.body, self._joints[-1])[8:10]
         self._paint(1.0)
 
     def reset(self, position: ArrayLike, yaw: float) -> None:
         """Place the gripper, open, at `position` (3,) metres, world frame, without simulating the way there."""
         for joint, angle in zip(self._joints, self._spec.home, strict=True):
             self._client.resetJointState(self.body, joint, angle)
-        for finger in self._spec.finger_links:
-            self._client.resetJointState(self.body, finger, self._spec.finger_travel)
+        for joint, angle in zip(self._gripper_joints, self._open, strict=True):
+            self._client.resetJointState(self.body, joint, angle)
         for joint, angle in zip(self._joints, self._solve(position, yaw), strict=True):
             self._client.resetJointState(self.body, joint, angle)
         self._command_arm(self._solve(position, yaw))
@@ -115,26 +155,26 @@ class Arm:
     @property
     def position(self) -> Array:
         """(3,) the point between the fingertips, world frame, metres."""
-        return np.array(self._hand_state()[4])
+        hand = self._hand_state()
+        return np.array(hand[4]) + self._rotation(hand[5]) @ self._spec.hand_from_tool
 
     @property
     def yaw(self) -> float:
         """Direction of the fingers' opening axis in [-pi/2, pi/2), rad."""
-        rotation = np.reshape(self._client.getMatrixFromQuaternion(self._hand_state()[5]), (3, 3))
-        heading = np.arctan2(rotation[1, 0], rotation[0, 0]) - self._spec.finger_yaw
-        return float((heading + np.pi / 2) % np.pi - np.pi / 2)
+        return float((self._heading + np.pi / 2) % np.pi - np.pi / 2)
 
     @property
     def aperture(self) -> float:
         """How far the gripper is open, 0 to 1."""
-        states = self._client.getJointStates(self.body, self._spec.finger_links)
-        return float(np.clip(sum(state[0] for state in states) / (2 * self._spec.finger_travel), 0.0, 1.0))
+        states = self._client.getJointStates(self.body, self._gripper_joints)
+        travel, moved = self._open - self._closed, np.array([state[0] for state in states]) - self._closed
+        return float(np.clip(moved @ travel / (travel @ travel), 0.0, 1.0))
 
     def holds(self, body: int) -> bool:
         """Whether both fingers press on `body` from opposite sides."""
         normals = []
         for finger in self._spec.finger_links:
-            contacts = self._client.getContactPoints(self.body, body, finger, -1)
+            contacts = chain(*(self._client.getContactPoints(self.body, body, link, -1) for link in finger))
             pushes = [np.array(contact[7]) for contact in contacts if contact[9] > 0]
             if not pushes:
                 return False
@@ -151,24 +191,40 @@ class Arm:
             self._paint(1.0)
 
     def _paint(self, alpha: float) -> None:
+        gripper = {*self._gripper_joints, *chain(*self._spec.finger_links)}
         for link in range(-1, self._client.getNumJoints(self.body)):
-            color = self._spec.finger_color if link in self._spec.finger_links else self._spec.color
+            color = self._spec.finger_color if link in gripper else self._spec.color
             self._client.changeVisualShape(self.body, link, rgbaColor=[*color[:3], alpha])
 
     def _hand_state(self) -> Any:
         return self._client.getLinkState(self.body, self._spec.hand_link, computeForwardKinematics=True)
 
+    @property
+    def _heading(self) -> float:
+        """Yaw up to a full turn, which tells the two fingers apart."""
+        rotation = self._rotation(self._hand_state()[5])
+        return float(np.arctan2(rotation[1, 0], rotation[0, 0])) - self._spec.finger_yaw
+
+    def _rotation(self, quaternion: Any) -> Array:
+        return np.reshape(self._client.getMatrixFromQuaternion(quaternion), (3, 3))
+
     def _solve(self, position: ArrayLike, yaw: float) -> list[float]:
+        """Return the arm's joint angles, rad, that bring the gripper to `position` (3,), its yaw up to half a turn."""
+        yaw = self._heading + nearest_turn(self._heading, yaw, period=np.pi)
         orientation = self._client.getQuaternionFromEuler([np.pi, 0.0, yaw + self._spec.finger_yaw])
+        hand = np.asarray(position, dtype=np.float64) - self._rotation(orientation) @ self._spec.hand_from_tool
         solution = self._client.calculateInverseKinematics(
             self.body,
             self._spec.hand_link,
-            np.asarray(position, dtype=np.float64).tolist(),
+            hand.tolist(),
             orientation,
             maxNumIterations=IK_ITERATIONS,
             residualThreshold=IK_RESIDUAL,
         )
-        return list(solution[: len(self._joints)])
+        *arm, wrist = solution[: len(self._joints)]
+        lower, upper = self._wrist_limits  # beyond them, half a turn back puts the fingers in each other's places
+        half_turns = np.ceil(max(wrist - upper, 0.0) / np.pi) - np.ceil(max(lower - wrist, 0.0) / np.pi)
+        return [*arm, float(wrist - np.pi * half_turns)]
 
     def _command_arm(self, angles: list[float]) -> None:
         count = len(self._joints)
@@ -184,8 +240,8 @@ class Arm:
     def _command_fingers(self, aperture: float) -> None:
         self._client.setJointMotorControlArray(
             self.body,
-            self._spec.finger_links,
+            self._gripper_joints,
             pybullet.POSITION_CONTROL,
-            targetPositions=[aperture * self._spec.finger_travel] * 2,
-            forces=[self._spec.finger_force] * 2,
+            targetPositions=(self._closed + aperture * (self._open - self._closed)).tolist(),
+            forces=self._gripper_forces.tolist(),
         )

@@ -7,11 +7,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from symview_sim import TASK_NAMES, gym_id
-from symview_sim.env import SymviewEnv
 from symview_sim.demonstration import episode_seed
+from symview_sim.env import SymviewEnv
+from symview_sim.robots import ROBOTS
 
 DIGEST = """
 import hashlib, sys
+from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
 env = SymviewEnv(sys.argv[1], oracle=True)
 digest = hashlib.sha256()
@@ -89,9 +91,10 @@ def _expert_states(env, seed):
     return np.array(states)
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("task", TASK_NAMES)
-def test_the_expert_succeeds(task):
-    env = SymviewEnv(task)
+def test_the_expert_succeeds(task, robot):
+    env = SymviewEnv(task, robot)
     outcomes, lengths = [], []
     for seed in range(10):
         env.reset(seed=episode_seed(0, seed))
@@ -147,3 +150,14 @@ def test_naming_tasks_does_not_start_a_simulator():
         "import sys, symview_sim, lerobot_symview;sys.exit(bool({'pybullet', 'lerobot', 'torch'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_gripper_goes_where_it_is_told(robot):
+    env = SymviewEnv("block_picking", robot)
+    arm = env.scene.arm
+    for x, y, z, yaw in [(0.45, 0.0, 0.2, 0.0), (0.25, -0.2, 0.03, 1.5), (0.65, 0.2, 0.02, -1.5)]:
+        arm.reset((x, y, z), yaw)
+        arm.move((x, y, z), yaw, 0.0)
+        np.testing.assert_allclose([*arm.position, arm.yaw], [x, y, z, yaw], atol=0.003)
+        assert arm.aperture == pytest.approx(0.0, abs=0.1)

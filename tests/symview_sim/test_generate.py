@@ -5,8 +5,8 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.placement import CameraSpec
-from symview_sim.env import SymviewEnv
 from symview_sim.demonstration import episode_seed
+from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from tests.conftest import EPISODES
 

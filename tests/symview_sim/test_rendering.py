@@ -38,7 +38,7 @@ def test_depth_unprojects_to_the_known_surfaces(scene, elevation, azimuth):
 def test_edges_appear_where_they_project(scene):
     camera = make_camera(45.0)
     with scene.arm.hidden():
-        rgb, _ = render(scene.client, camera)
+        rgb, _, _ = render(scene.client, camera)
     red = rgb[..., 0].astype(int) > 2 * rgb[..., 1].astype(int)
     near = np.array([[0.6, y, z] for y in (-0.12, 0.12) for z in (0.0, 0.04)])
     pixels, _ = project(near, camera)
