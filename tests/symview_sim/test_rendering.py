@@ -48,7 +48,7 @@ def test_edges_appear_where_they_project(scene):
 
 
 def test_above_the_horizon_depth_is_invalid(scene):
-    _, depth = render(scene.client, make_camera(10.0, 180.0))
+    _, depth, _ = render(scene.client, make_camera(10.0, 180.0))
     assert (depth[0] == 0).any()
     assert (depth[-1] > 0).all()
 
