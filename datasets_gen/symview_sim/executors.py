@@ -7,11 +7,11 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from lerobot_symview.cli import CommandError, quiet
 from lerobot_symview.names import lookup
@@ -21,7 +21,7 @@ class Executor(Protocol):
     """Runs functions that can be pickled; a context manager."""
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
-        """Yield `function(argument)` for every argument, in the order in which they are done."""
+        """Start `function(argument)` for every argument; return the results in the order in which they are done."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -46,18 +46,15 @@ class SerialExecutor:
 
 
 class ProcessExecutor:
-    """Runs in processes of this machine, forked from a server that imports what they need once.
+    """Runs in processes of this machine.
 
     Args:
         num_workers: how many processes.
-        preload: modules the server imports; a LeRobot import takes seconds.
     """
 
-    def __init__(self, num_workers: int, preload: list[str]):
+    def __init__(self, num_workers: int):
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(preload)
         self._pool = ProcessPoolExecutor(num_workers, mp_context=context, initializer=_start_worker)
-        self._pool.submit(os.getpid)  # starts the server, which imports while this process goes on
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
         """Yield the results as they come.
@@ -65,8 +62,11 @@ class ProcessExecutor:
         Raises:
             CommandError: if a process dies.
         """
+        return self._results([self._pool.submit(function, argument) for argument in arguments])
+
+    def _results[R](self, futures: list[Future[R]]) -> Iterator[R]:
         try:
-            for future in as_completed([self._pool.submit(function, argument) for argument in arguments]):
+            for future in as_completed(futures):
                 yield future.result()
         except BrokenProcessPool:
             raise CommandError(
@@ -104,7 +104,9 @@ class RayExecutor:
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
         """Yield the results as they come; Ray repeats what a lost worker had begun."""
         task = self._ray.remote(lambda argument: function(argument))
-        pending = [task.remote(argument) for argument in arguments]
+        return self._results([task.remote(argument) for argument in arguments])
+
+    def _results(self, pending: list[Any]) -> Iterator[Any]:
         try:
             while pending:
                 done, pending = self._ray.wait(pending)
@@ -119,10 +121,10 @@ class RayExecutor:
         self._ray.shutdown()
 
 
-def make_executor(kind: str, num_workers: int, preload: list[str]) -> Executor:
+def make_executor(kind: str, num_workers: int) -> Executor:
     """Return the executor `kind` (`local` or `ray`) with `num_workers` processes."""
     makers: dict[str, Callable[[], Executor]] = {
-        "local": lambda: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers, preload),
+        "local": lambda: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers),
         "ray": lambda: RayExecutor(num_workers),
     }
     return lookup("executor", kind, makers)()

@@ -37,9 +37,6 @@ EXAMPLES = """\
   symview-generate --root=data/anywhere --env.camera.spread.azimuth_deg=180 --env.camera.spread.elevation_deg=20
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
-# What a worker imports besides this package; the fork server does it once for all.
-PRELOADED = ["symview_sim.recording", "lerobot.datasets"]
-
 
 @dataclass(frozen=True)
 class RecordedEnv(EnvSettings):
@@ -106,7 +103,7 @@ def generate(config: GenerateConfig) -> Path:
     _open(recording, config.resume)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
-    with make_executor(config.executor, config.num_workers, PRELOADED) as executor:
+    with make_executor(config.executor, config.num_workers) as executor:
         with tqdm(desc=config.env.task, total=config.num_episodes, initial=len(attempts), unit="episode") as bar:
             done, tried = len(attempts), sum(attempts.values())
             for taken in executor.run(partial(record_episode, recording), missing):
@@ -115,6 +112,8 @@ def generate(config: GenerateConfig) -> Path:
                 bar.update()
         shards = recording.shards()
         written = executor.run(partial(write_shard, recording), shards)
+        import lerobot.datasets  # noqa: F401  which takes seconds, while the workers import and write
+
         folders = list(tqdm(written, desc="writing", total=len(shards), unit="shard"))
     join_shards(recording, sorted(folders)).rename(target)
     shutil.rmtree(recording.folder)

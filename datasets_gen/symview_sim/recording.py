@@ -133,7 +133,7 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
                     concatenate_data=False,
                     concatenate_videos=False,
                 )
-        _state_success_rate(joined, len(attempts) / sum(attempts.values()))
+        _complete_metadata(joined, len(attempts) / sum(attempts.values()))
         (joined / "meta" / "symview_recording.json").write_text(json.dumps(recording.description(), indent=4))
     return joined
 
@@ -172,15 +172,16 @@ def _frames(file: Path) -> Iterator[Episode]:
         yield {key: values[index] for key, values in episode.items()}
 
 
-def _state_success_rate(dataset: Path, rate: float) -> None:
-    """Complete the facts of every camera's features."""
-    file = dataset / "meta" / "info.json"
-    content = json.loads(file.read_text())
+def _complete_metadata(dataset: Path, success_rate: float) -> None:
+    """State the expert's success with the facts of every camera, and sort the statistics, which come in any order."""
+    info, stats = dataset / "meta" / "info.json", dataset / "meta" / "stats.json"
+    content = json.loads(info.read_text())
     for feature in content["features"].values():
         facts = (feature.get("info") or {}).get("symview")
         if facts is not None:
-            facts["expert_success_rate"] = rate
-    file.write_text(json.dumps(content, indent=4))
+            facts["expert_success_rate"] = success_rate
+    info.write_text(json.dumps(content, indent=4))
+    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
 
 
 @contextmanager
