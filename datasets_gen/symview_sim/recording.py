@@ -74,10 +74,13 @@ def record_episode(recording: Recording, episode: int) -> int:
     frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
     file = recording.episode_file(episode)
     part = file.with_suffix(".part")
-    with _disk_errors(recording.folder):
-        with part.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **frames, **{ATTEMPTS_KEY: attempts})
-        part.replace(file)
+    try:
+        with _disk_errors(recording.folder):
+            with part.open("wb") as stream:
+                np.savez(stream, allow_pickle=False, **frames, **{ATTEMPTS_KEY: attempts})
+            part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
     return attempts
 
 
@@ -139,9 +142,11 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
 
 
 def _create_dataset(recording: Recording, root: Path) -> Any:
+    import av
     from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
+    av.logging.set_libav_level(av.logging.ERROR)  # FFmpeg tells of every pass over a file
     lossless = {"x265-params": "lossless=1:log-level=none"}
     encoders = {
         "rgb_encoder": RGBEncoderConfig(vcodec="hevc", pix_fmt="gbrp", crf=None, extra_options=lossless),

@@ -15,13 +15,15 @@ from lerobot_symview.camera import Array
 from symview_sim.bullet import pybullet
 from symview_sim.motions import nearest_turn
 
-ARM_STEPS, GRIPPER_STEPS = 50, 20  # simulation steps at 1/240 s: 0.29 s an action
+ARM_STEPS, GRIPPER_STEPS = 50, 25  # simulation steps at 1/240 s: 0.31 s an action
 RAMP_STEPS = 34  # of the arm's steps, in which its target moves to the goal; it settles in the others
 POSITION_GAIN = 0.2
 # Steel on wood. Grippier fingers jam on a cube's corners instead of turning it into line: at 1.0 a cube held 35 degrees
 # askew stays so, at 0.2 it slips out.
 FINGER_FRICTION = 0.3
-IK_ITERATIONS, IK_RESIDUAL = 200, 1e-6
+# Always this many: Bullet stops early when the position is right, whatever the orientation, and then a turn on the spot
+# ends 14 cm away.
+IK_ITERATIONS, IK_RESIDUAL = 150, 0.0
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion
 
 
@@ -215,8 +217,17 @@ class Arm:
 
     def _solve(self, position: ArrayLike, yaw: float) -> list[float]:
         """Return the arm's joint angles, rad, that bring the gripper to `position` (3,), its yaw up to half a turn."""
-        yaw = self._heading + nearest_turn(self._heading, yaw, period=np.pi)
-        orientation = self._client.getQuaternionFromEuler([np.pi, 0.0, yaw + self._spec.finger_yaw])
+        turn = nearest_turn(self._heading, yaw, period=np.pi)
+        lower, upper = self._wrist_limits
+        for half_turn in (0.0, -np.copysign(np.pi, turn)):  # back, where the near way leads past the wrist's limits
+            *arm, wrist = self._inverse_kinematics(position, self._heading + turn + half_turn)
+            wrist = (wrist + np.pi) % (2 * np.pi) - np.pi
+            if lower <= wrist <= upper:
+                break
+        return [*arm, wrist]
+
+    def _inverse_kinematics(self, position: ArrayLike, heading: float) -> list[float]:
+        orientation = self._client.getQuaternionFromEuler([np.pi, 0.0, heading + self._spec.finger_yaw])
         hand = np.asarray(position, dtype=np.float64) - self._rotation(orientation) @ self._spec.hand_from_tool
         solution = self._client.calculateInverseKinematics(
             self.body,
@@ -226,10 +237,7 @@ class Arm:
             maxNumIterations=IK_ITERATIONS,
             residualThreshold=IK_RESIDUAL,
         )
-        *arm, wrist = solution[: len(self._joints)]
-        lower, upper = self._wrist_limits  # beyond them, half a turn back puts the fingers in each other's places
-        half_turns = np.ceil(max(wrist - upper, 0.0) / np.pi) - np.ceil(max(lower - wrist, 0.0) / np.pi)
-        return [*arm, float(wrist - np.pi * half_turns)]
+        return list(solution[: len(self._joints)])
 
     def _command_arm(self, angles: list[float]) -> None:
         count = len(self._joints)

@@ -73,11 +73,11 @@ class Scene:
         self.client.changeDynamics(body, -1, lateralFriction=friction)
         return int(body)
 
-    def add_marking(self, side: float, color: Color, place: Array) -> None:
-        """Paint a square of `side` metres on the table around `place` (2,): it is seen and not felt."""
+    def add_marking(self, side: float, color: Color, place: Array) -> int:
+        """Paint a square of `side` metres on the table around `place` (2,), seen and not felt; return its body id."""
         half_extents = [side / 2, side / 2, MARKING_HEIGHT / 2]
         shape = self.client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=[*color, 1.0])
-        self.client.createMultiBody(0, -1, shape, [*np.asarray(place).tolist(), MARKING_HEIGHT / 2])
+        return int(self.client.createMultiBody(0, -1, shape, [*np.asarray(place).tolist(), MARKING_HEIGHT / 2]))
 
     def add_compound(
         self, parts: Sequence[Part], mass: float, friction: float, color: Color, position: Vector, yaw: float

@@ -21,6 +21,11 @@ from symview_sim.settings import EnvSettings
 from symview_sim.tasks import TASK_NAMES
 
 REPEATS = 50
+TIMED = {
+    "physics_ms": "stepSimulation",
+    "inverse_kinematics_ms": "calculateInverseKinematics",
+    "render_ms": "getCameraImage",
+}
 
 EXAMPLES = """\
   symview-benchmark experts --seeds=200
@@ -83,44 +88,71 @@ def benchmark_experts(config: ExpertsBenchmark) -> dict[str, dict[str, float]]:
 
 
 def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
-    """Return what a step, a reset, a rendering and the motion of a step cost, and episodes per second.
+    """Return what a step and a reset cost and where a step's time goes, in milliseconds, and episodes per second.
 
-    `episodes_per_s` counts simulated expert episodes, `saved_episodes_per_s` those written to a dataset, start-up of
-    LeRobot's writer included.
+    `physics_ms`, `inverse_kinematics_ms` and `render_ms` are the simulator's parts of `step_ms`, `other_ms` the rest.
+    `floor_ms` is what the same number of simulation steps takes with the arm in free air and one rendering: below it
+    only fewer steps or a smaller image lead. `episodes_per_s` counts simulated expert episodes, `saved_episodes_per_s`
+    those written to a dataset.
     """
-    from symview_sim.rendering import render
-
     env = config.env.make()
+    client, arm = env.scene.client, env.scene.arm
+    parts = {name: _Timed(client, function) for name, function in TIMED.items()}
     resets, steps = [], []
+    spent: dict[str, list[float]] = {name: [] for name in parts}
     start = time.perf_counter()
     for seed in tqdm(range(config.episodes), desc=config.env.task, unit="episode"):
         resets.append(_milliseconds(env.reset, seed=seed))
         done = False
         while not done:
             action = env.expert_action()
-            before = time.perf_counter()
+            before = {name: part.milliseconds for name, part in parts.items()}
+            begin = time.perf_counter()
             _, _, terminated, truncated, _ = env.step(action)
-            steps.append(1000 * (time.perf_counter() - before))
+            steps.append(1000 * (time.perf_counter() - begin))
+            for name, part in parts.items():
+                spent[name].append(part.milliseconds - before[name])
             done = terminated or truncated
     simulated = config.episodes / (time.perf_counter() - start)
-    scene, camera = env.scene, next(iter(env.cameras.values()))
-    renders = [_milliseconds(render, scene.client, camera) for _ in range(REPEATS)]
-    motions = [_milliseconds(scene.arm.move, scene.arm.position, scene.arm.yaw, 1.0) for _ in range(REPEATS)]
+    env.reset(seed=0)
+    before_free = parts["physics_ms"].milliseconds
+    for _ in range(REPEATS):
+        arm.move(arm.position, arm.yaw, 1.0)
+    free = (parts["physics_ms"].milliseconds - before_free) / REPEATS
     env.close()
+    costs = {name: statistics.median(values) for name, values in spent.items()}
+    step = statistics.median(steps)
     return {
-        "step_ms": statistics.median(steps),
+        "step_ms": step,
+        **costs,
+        "other_ms": step - sum(costs.values()),
+        "floor_ms": free + costs["render_ms"],
         "reset_ms": statistics.median(resets),
-        "render_ms": statistics.median(renders),
-        "physics_ms": statistics.median(motions),
         "episodes_per_s": simulated,
         "saved_episodes_per_s": _saved_per_second(config),
     }
 
 
+class _Timed:
+    """Replaces a function of a simulator by itself with a clock."""
+
+    def __init__(self, client: Any, name: str):
+        self.milliseconds = 0.0
+        function = getattr(client, name)
+
+        def timed(*arguments: Any, **options: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*arguments, **options)
+            self.milliseconds += 1000 * (time.perf_counter() - start)
+            return result
+
+        setattr(client, name, timed)
+
+
 def _saved_per_second(config: EnvBenchmark) -> float:
     import lerobot.datasets  # noqa: F401  imported before the clock starts: it takes longer than the writing
 
-    recorded = RecordedEnv(task=config.env.task, robot=config.env.robot, camera=config.env.camera, oracle=False)
+    recorded = RecordedEnv(**(vars(config.env) | {"oracle": config.env.oracle}))
     with tempfile.TemporaryDirectory() as folder:
         target = DatasetTarget("benchmark/recorded", Path(folder) / "recorded")
         start = time.perf_counter()

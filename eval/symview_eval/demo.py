@@ -58,6 +58,8 @@ def stages(config: DemoConfig) -> list[Stage]:
         f"--env.task={TASK}",
         f"--num_episodes={config.demonstrations}",
         f"--seed={config.seed}",
+        "--num_workers=2",
+        "--resume=true",
     )
     # Only the views go into the training set: LeRobot decodes every image of a frame, wanted or not.
     add_views = (

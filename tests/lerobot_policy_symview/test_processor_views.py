@@ -7,8 +7,8 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres
 from lerobot_symview import keys
 from lerobot_symview.views import VIEWS, make_view
+from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
-from symview_sim.generate import FIRST_SEED
 from tests.conftest import VIEW_SIZE
 
 OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
@@ -18,7 +18,7 @@ OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
 def observed():
     """A batch of one observation, as lerobot-eval hands it to the processors: the first frame of the recording."""
     env = SymviewEnv("block_picking")
-    observation, _ = env.reset(seed=FIRST_SEED)
+    observation, _ = env.reset(seed=episode_seed(0, 0))
     env.close()
     batched = {
         key: {name: image[None] for name, image in value.items()} if isinstance(value, dict) else value[None]

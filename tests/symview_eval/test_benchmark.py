@@ -18,9 +18,12 @@ def test_the_environment_benchmark_names_every_cost(monkeypatch, capsys):
     results = json.loads(capsys.readouterr().out)
     assert list(results) == [
         "step_ms",
-        "reset_ms",
-        "render_ms",
         "physics_ms",
+        "inverse_kinematics_ms",
+        "render_ms",
+        "other_ms",
+        "floor_ms",
+        "reset_ms",
         "episodes_per_s",
         "saved_episodes_per_s",
     ]

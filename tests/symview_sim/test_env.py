@@ -1,11 +1,13 @@
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from lerobot_symview.placement import CameraSpec, CameraSpread
 from symview_sim import TASK_NAMES, gym_id
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
@@ -38,11 +40,100 @@ REFERENCE_LENGTHS = {
 }
 
 
+SIDE, LEFT = CameraSpec(height=32, width=32), CameraSpec("left", height=24, width=40, azimuth_deg=90.0)
+MOVING = replace(SIDE, spread=CameraSpread(azimuth_deg=180.0, elevation_deg=10.0))
+NOISY = replace(SIDE, depth_noise=0.002, depth_dropout=0.02)
+MODES = {
+    "rgbd": {"cameras": (SIDE,)},
+    "rgb": {"cameras": (SIDE,), "depth": False},
+    "segmentation": {"cameras": (SIDE,), "segmentation": True},
+    "oracle": {"cameras": (SIDE,), "oracle": True},
+    "two cameras": {"cameras": (SIDE, LEFT)},
+    "moving camera": {"cameras": (MOVING,)},
+    "noisy depth": {"cameras": (NOISY,)},
+    "all": {"cameras": (replace(MOVING, depth_noise=0.002), LEFT), "oracle": True, "segmentation": True},
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASK_NAMES)
-def test_gymnasiums_own_checker_is_satisfied(task):
-    env = gymnasium.make(gym_id(task)).unwrapped
+def test_gymnasiums_own_checker_is_satisfied(task, mode):
+    env = gymnasium.make(gym_id(task), **MODES[mode]).unwrapped
     check_env(env, skip_render_check=True)
     env.close()
+
+
+def test_one_seed_sees_the_same_scene_through_any_camera():
+    states = []
+    for mode in MODES.values():
+        env = SymviewEnv("block_pushing", **mode)
+        states.append(_expert_states(env, 3))
+        env.close()
+    for state in states[1:]:
+        np.testing.assert_array_equal(state, states[0])
+
+
+def test_a_moving_camera_moves_between_episodes_and_tells_where_it_is():
+    env = SymviewEnv("block_picking", cameras=(MOVING,))
+    poses = []
+    for seed in (0, 1, 0):
+        observation, _ = env.reset(seed=seed)
+        after, *_ = env.step(env.expert_action())
+        poses.append(observation["camera.side.world_from_cam"])
+        np.testing.assert_array_equal(after["camera.side.world_from_cam"], poses[-1])
+    assert np.abs(poses[0] - poses[1]).max() > 0.1
+    np.testing.assert_array_equal(poses[0], poses[2])
+
+
+def test_segmentation_labels_table_robot_and_objects():
+    env = SymviewEnv("block_picking", cameras=(CameraSpec(),), oracle=True, segmentation=True)
+    for seed in range(2):  # bodies get new ids in every episode
+        pixels = env.reset(seed=seed)[0]["pixels"]
+        labels = pixels["side_segmentation"]
+        assert set(np.unique(labels)) == {0, 1, 2}
+        np.testing.assert_array_equal(labels[..., 0], labels[..., 2])
+        red = pixels["side"][..., 0] > 2.0 * pixels["side"][..., 1]
+        np.testing.assert_array_equal(labels[..., 0] == 2, red)
+        assert set(np.unique(pixels["top_segmentation"])) == {0, 2}
+
+
+def test_noise_is_in_the_depth_alone_and_new_in_every_frame():
+    exact, noisy = SymviewEnv("block_picking", cameras=(SIDE,)), SymviewEnv("block_picking", cameras=(NOISY,))
+    still = np.array([0, 0, 0, 0, 1], dtype=np.float32)
+    depths = []
+    for env in (exact, noisy):
+        env.reset(seed=0)
+        depths.append([env.step(still)[0]["images.side_depth"] for _ in range(2)])
+        assert env.reset(seed=0)[0]["pixels"]["side"].any()
+    error = depths[1][0] - depths[0][0]
+    assert 0.0 < np.abs(error[depths[1][0] > 0]).max() < 0.02
+    assert 0.01 < (depths[1][0] == 0).mean() < 0.2
+    assert not np.array_equal(depths[1][0], depths[1][1])
+
+
+def test_two_cameras_of_one_name_are_refused():
+    with pytest.raises(ValueError, match="differ in their names, got side, side"):
+        SymviewEnv("block_picking", cameras=(SIDE, SIDE))
+
+
+def test_render_is_large_enough_to_watch():
+    env = SymviewEnv("block_picking", cameras=(LEFT,))
+    env.reset(seed=0)
+    assert env.render().shape == (256, 427, 3)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_gripper_turns_on_the_spot_past_a_right_angle(robot):
+    env = SymviewEnv("block_picking", robot, cameras=())
+    env.reset(seed=0)
+    errors = []
+    for direction in (1, -1):
+        for _ in range(12):  # one and a half turns: past the wrist's limits, where it has to go half a turn back
+            expected = env.scene.arm.yaw + direction * np.pi / 4
+            env.step(np.array([0, 0, 0, direction * np.pi / 4, 1.0]))
+            errors.append(abs((env.scene.arm.yaw - expected + np.pi / 2) % np.pi - np.pi / 2))
+            np.testing.assert_allclose(env.scene.arm.position, [0.45, 0.0, 0.2], atol=0.005)
+    assert max(errors) < 0.01
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)

@@ -27,12 +27,12 @@ class BlockPushing(Task):
         cube, goal = random_places(rng, scene.workspace, paddings=(0.06, 0.065), distance=0.09)
         yaw = rng.uniform(-np.pi / 2, np.pi / 2)
         self._cube = scene.add_box((EDGE, EDGE, EDGE), 0.1, 1.0, (0.9, 0.1, 0.1), (*cube, EDGE / 2), yaw)
-        self._goal = goal
-        scene.add_marking(GOAL_EDGE, (0.1, 0.2, 0.9), goal)
+        self._goal = scene.add_marking(GOAL_EDGE, (0.1, 0.2, 0.9), goal)
 
     def is_success(self, scene: Scene) -> bool:
         """Whether the cube is on the square."""
-        return bool(np.linalg.norm(scene.pose(self._cube)[0][:2] - self._goal) < CLOSE)
+        cube, goal = scene.pose(self._cube)[0], scene.pose(self._goal)[0]
+        return bool(np.linalg.norm((cube - goal)[:2]) < CLOSE)
 
     def is_valid(self, scene: Scene) -> bool:
         """Whether the cube is where the gripper can reach it."""
@@ -40,10 +40,10 @@ class BlockPushing(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Sweep, half open, along the line from the cube to the square."""
-        cube = scene.pose(self._cube)[0][:2]
-        along = (self._goal - cube) / np.linalg.norm(self._goal - cube)
+        cube, goal = scene.pose(self._cube)[0][:2], scene.pose(self._goal)[0][:2]
+        along = (goal - cube) / np.linalg.norm(goal - cube)
         start = scene.clip_to_workspace(cube - BEHIND * along)
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, self._goal - SHORT * along, HEIGHT)
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, goal - SHORT * along, HEIGHT)
         return np.append(motion, 0.5)
 
 

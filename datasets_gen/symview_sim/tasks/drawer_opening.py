@@ -29,7 +29,6 @@ class DrawerOpening(Task):
         offset = rng.uniform([0.15, -0.10], [0.20, 0.10])
         rotation = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
         place = np.asarray(scene.workspace.center) + rotation @ offset
-        self._inward = rotation[:, 0]
         self._cabinet = scene.add_drawer(cabinet_parts(), drawer_parts(), (*place, 0.0), yaw, TRAVEL)
 
     def is_success(self, scene: Scene) -> bool:
@@ -42,10 +41,11 @@ class DrawerOpening(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Go down behind the handle with closed fingers, then pull."""
-        cabinet, _ = scene.pose(self._cabinet)
-        bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * self._inward
-        start = bar + BEHIND * self._inward
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * self._inward, HEIGHT, PULL_SPEED)
+        cabinet, yaw = scene.pose(self._cabinet)
+        inward = np.array([np.cos(yaw), np.sin(yaw)])
+        bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * inward
+        start = bar + BEHIND * inward
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * inward, HEIGHT, PULL_SPEED)
         return np.append(motion, CLOSED)
 
 
