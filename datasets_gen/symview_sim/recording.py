@@ -30,6 +30,8 @@ from symview_sim.settings import EnvSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
 ATTEMPTS_KEY = "attempts"
+# With its own block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images in spite of `lossless`.
+LOSSLESS = "lossless=1:ctu=16:bframes=0"
 MAX_VIDEO_DEPTH = 1.6  # metres: with 12 bits, steps of 0.39 mm and errors of at most 0.2 mm
 
 
@@ -147,7 +149,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
     from lerobot.datasets import LeRobotDataset
 
     av.logging.set_libav_level(av.logging.ERROR)  # FFmpeg tells of every pass over a file
-    lossless = {"x265-params": "lossless=1:log-level=none"}
+    lossless = {"x265-params": f"{LOSSLESS}:log-level=none"}
     encoders = {
         "rgb_encoder": RGBEncoderConfig(vcodec="hevc", pix_fmt="gbrp", crf=None, extra_options=lossless),
         "depth_encoder": DepthEncoderConfig(

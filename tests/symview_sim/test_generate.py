@@ -1,14 +1,71 @@
+import filecmp
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
-from lerobot_symview.placement import CameraSpec
-from symview_sim.demonstration import episode_seed
+from lerobot_symview.placement import CameraSpec, CameraSpread
+from symview_sim import recording
+from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from tests.conftest import EPISODES
+
+SMALL = RecordedEnv(camera=CameraSpec(height=32, width=32), oracle=False)
+COMMAND = Path(sys.executable).parent / "symview-generate"
+
+
+def config(root, **options):
+    defaults = {"env": SMALL, "num_episodes": 5}
+    return GenerateConfig(DatasetTarget("test/small", root), **(defaults | options))
+
+
+def assert_same_data(folder, other):
+    """The same tables and bytes; Hugging Face's datasets write a hash of the folder's name into a table's metadata."""
+    files, others = ({p.relative_to(f) for p in f.rglob("*") if p.is_file()} for f in (folder, other))
+    assert files == others
+    for file in files:
+        if file.suffix == ".parquet":
+            assert pq.read_table(folder / file).equals(pq.read_table(other / file)), file
+        else:
+            assert filecmp.cmp(folder / file, other / file, shallow=False), file
+
+
+@contextmanager
+def largest_file(size):
+    """Let every write beyond `size` bytes of a file fail, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.fixture(scope="module")
+def small_shards():
+    """Three shards of five episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recording, "SHARD_EPISODES", 2)
+        yield
+
+
+@pytest.fixture(scope="module")
+def reference(small_shards, tmp_path_factory):
+    return generate(config(tmp_path_factory.mktemp("reference") / "data"))
 
 
 def test_the_dataset_holds_what_the_environment_showed(recorded):
@@ -47,13 +104,140 @@ def test_every_episode_ends_in_success(recorded):
     assert all(dataset[i]["next.success"] for i in last)
 
 
-def test_the_camera_is_a_choice(tmp_path):
-    camera = CameraSpec(name="front", height=64, width=80, elevation_deg=30.0, azimuth_deg=20.0)
-    target = DatasetTarget("test/front", tmp_path / "front")
-    folder = generate(GenerateConfig(target, RecordedEnv(camera=camera, oracle=False), num_episodes=1))
-    dataset = LeRobotDataset("test/front", root=folder)
-    assert sorted(dataset.meta.camera_keys) == ["observation.images.front", "observation.images.front_depth"]
-    assert dataset.meta.features["observation.images.front"]["info"]["symview"]["placement"]["elevation_deg"] == 30.0
+def test_cameras_are_a_choice_and_described(tmp_path):
+    front = CameraSpec("front", 64, 80, elevation_deg=50.0, spread=CameraSpread(azimuth_deg=180.0))
+    left = CameraSpec("left", 48, 48, azimuth_deg=90.0)
+    env = RecordedEnv(task="drawer_opening", camera=front, more_cameras=(left,), oracle=False, segmentation=True)
+    folder = generate(config(tmp_path / "data", env=env, num_episodes=2, seed=3, noise=0.05))
+    dataset = LeRobotDataset("test/small", root=folder)
+    names = ("front", "front_depth", "front_segmentation", "left", "left_depth", "left_segmentation")
+    assert sorted(dataset.meta.camera_keys) == [f"observation.images.{name}" for name in names]
+    assert dataset[0][keys.rgb("front")].shape == (3, 64, 80)
+    starts = dataset.meta.episodes["dataset_from_index"]
+    poses = [dataset[int(start)][keys.world_from_cam("front")].numpy() for start in starts]
+    assert np.abs(poses[0] - poses[1]).max() > 0.05
+    facts = dataset.meta.features[keys.rgb("front")]["info"]["symview"]
+    assert facts["placement"]["spread"]["azimuth_deg"] == 180.0
+    assert (facts["task"], facts["seed"], facts["noise"], facts["robot"]) == ("drawer_opening", 3, 0.05, "panda")
+    assert facts["pybullet"].startswith("3.")
+    assert 0.5 < facts["expert_success_rate"] <= 1.0
+    assert facts["workspace"]["size"] == 0.4
+    assert dataset.meta.features[keys.segmentation("left")]["info"]["symview"]["labels"]["1"] == "robot"
+
+
+def test_video_keeps_colour_exactly_and_depth_to_a_fifth_of_a_millimetre(tmp_path):
+    camera = CameraSpec(height=64, width=64, depth_noise=0.01, depth_dropout=0.1)
+    env = RecordedEnv(camera=camera, segmentation=True)
+    folder = generate(config(tmp_path / "data", env=env, num_episodes=1, video=True))
+    dataset = LeRobotDataset("test/small", root=folder, depth_output_unit="m", video_backend="pyav")
+    videos = {key for key, feature in dataset.meta.features.items() if feature["dtype"] == "video"}
+    assert videos == set(dataset.meta.camera_keys) - {keys.depth("top")}
+    episode, _ = demonstrate(env, 0, 0, 0.0)
+    for index in range(len(dataset)):
+        item = dataset[index]
+        for key in dataset.meta.camera_keys:
+            stored, shown = item[key].permute(1, 2, 0).numpy(), episode[key][index]
+            if shown.dtype == np.uint8:
+                np.testing.assert_array_equal(np.rint(stored * 255), shown)
+            else:
+                assert np.abs(stored - shown)[shown <= recording.MAX_VIDEO_DEPTH].max(initial=0.0) < 2e-4
+                np.testing.assert_array_equal(stored[shown == 0], 0.0)
+    assert (episode[keys.depth("side")] == 0).any()
+
+
+def test_a_camera_too_far_away_for_video_depth_is_refused(tmp_path):
+    env = RecordedEnv(camera=CameraSpec(distance=1.6, fov_deg=25.0))
+    with pytest.raises(ValueError, match="video=true stores depth up to"):
+        generate(config(tmp_path / "data", env=env, video=True))
+
+
+def test_the_number_of_workers_does_not_change_the_data(reference, tmp_path):
+    assert_same_data(generate(config(tmp_path / "data", num_workers=2)), reference)
+
+
+def test_a_ray_cluster_writes_the_same_data(reference, tmp_path):
+    assert_same_data(generate(config(tmp_path / "data", num_workers=2, executor="ray")), reference)
+
+
+def test_a_disturbed_expert_is_repeated_until_it_succeeds(small_shards, tmp_path):
+    """Attempts are counted, and belong to the episode, not to the worker that makes them."""
+    folder = generate(config(tmp_path / "data", num_episodes=3, noise=0.9))
+    facts = LeRobotDataset("test/small", root=folder).meta.features[keys.rgb("side")]["info"]["symview"]
+    attempts = [demonstrate(SMALL, 0, episode, 0.9)[1] for episode in range(3)]
+    assert sum(attempts) > 3
+    assert facts["expert_success_rate"] == pytest.approx(3 / sum(attempts))
+
+
+def test_a_full_disk_is_reported_and_the_recording_goes_on_later(reference, small_shards, tmp_path):
+    root = tmp_path / "data"
+    with largest_file(10_000), pytest.raises(CommandError, match=r"cannot write to .*MiB free.*--resume=true"):
+        generate(config(root))
+    assert not root.exists()
+    assert not list((tmp_path / "data.partial" / "episodes").iterdir())
+    assert_same_data(generate(config(root, resume=True)), reference)
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_an_image_that_lerobot_fails_to_write_is_noticed(small_shards, tmp_path):
+    plan = _begun(tmp_path, env=RecordedEnv(oracle=False))
+    with largest_file(50_000), pytest.raises(CommandError, match=r"Error writing image .*side_depth"):  # of 92 kB
+        recording.write_shard(plan, range(2))
+    assert not plan.shard_folder(range(2)).exists()
+
+
+def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tmp_path):
+    _begun(tmp_path)
+    with pytest.raises(CommandError, match="add --resume=true"):
+        generate(config(tmp_path / "data"))
+    with pytest.raises(CommandError, match="another recording, which differs in features, seed"):
+        generate(config(tmp_path / "data", seed=1, resume=True))
+    with pytest.raises(CommandError, match="differs in env, features"):
+        generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
+
+
+def test_resuming_what_is_complete_does_nothing(reference):
+    before = {path: path.stat().st_mtime_ns for path in reference.rglob("*")}
+    assert generate(config(reference, resume=True)) == reference
+    assert {path: path.stat().st_mtime_ns for path in reference.rglob("*")} == before
+    with pytest.raises(CommandError, match="exists already"):
+        generate(config(reference, resume=True, seed=1))
+
+
+def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monkeypatch):
+    """Two workers are killed during simulation, during writing, and whenever else the dice say."""
+    root, partial = tmp_path / "data", tmp_path / "data.partial"
+    command = [COMMAND, f"--root={root}", "--num_episodes=6", "--num_workers=2", "--resume=true"]
+    command += ["--env.oracle=false", "--env.camera.height=32", "--env.camera.width=32", "--dataset.repo_id=test/small"]
+    dice = random.Random(0)
+    moments = [lambda n=n: len(list(partial.glob("episodes/*.npz"))) >= n for n in (1, 4)]
+    moments.append(lambda: any(partial.glob("shards/*.part/*")))
+    kept = 0
+    for moment in moments:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not moment():
+            assert process.poll() is None
+            time.sleep(0.02)
+        time.sleep(0.2 * dice.random())
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        assert not root.exists()
+        episodes = list(partial.glob("episodes/*.npz"))
+        for file in episodes:
+            with np.load(file) as content:
+                assert content[keys.ACTION].shape[1] == 5
+        assert len(episodes) >= kept
+        kept = len(episodes)
+    subprocess.run(command, check=True, capture_output=True)
+    monkeypatch.setattr(recording, "SHARD_EPISODES", 25)  # as the command has it
+    expected = generate(config(tmp_path / "expected", num_episodes=6))
+    assert_same_data(root, expected)
+
+
+def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
+    from symview_sim.executors import ProcessExecutor
+
+    with ProcessExecutor(1) as executor, pytest.raises(CommandError, match="worker process died"):
+        list(executor.run(os._exit, [1]))
 
 
 def test_an_existing_dataset_is_not_overwritten(recorded):
@@ -61,14 +245,24 @@ def test_an_existing_dataset_is_not_overwritten(recorded):
         generate(GenerateConfig(DatasetTarget("test/recorded", recorded), num_episodes=1))
 
 
-def test_a_failure_leaves_nothing_behind(tmp_path):
-    camera = CameraSpec(fov_deg=5.0)
+def test_a_refused_request_leaves_nothing_behind(tmp_path):
     with pytest.raises(ValueError, match="of the workspace"):
-        generate(GenerateConfig(DatasetTarget("test/none", tmp_path / "none"), RecordedEnv(camera=camera)))
+        generate(config(tmp_path / "none", env=RecordedEnv(camera=CameraSpec(fov_deg=5.0))))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [{"num_episodes": 0}, {"noise": 2.0}, {"seed": -1}])
+@pytest.mark.parametrize("options", [{"num_episodes": 0}, {"noise": 2.0}, {"seed": -1}, {"num_workers": 0}])
 def test_impossible_requests_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         GenerateConfig(DatasetTarget("a/b"), **options)
+
+
+def _begun(folder, **options):
+    """Begin a recording in `folder` and simulate two of its five episodes; return what workers are told."""
+    from symview_sim import generate as module
+
+    plan = module._plan(config(folder / "data", **options), folder / "data")
+    module._open(plan, resume=False)
+    for episode in range(2):
+        recording.record_episode(plan, episode)
+    return plan
