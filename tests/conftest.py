@@ -16,7 +16,7 @@ from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.workspace import Workspace
-from symview_sim.generate import GenerateConfig, generate
+from symview_sim.generate import GenerateConfig, RecordedDataset, generate
 
 VIEW_SIZE = 76
 EPISODES = 2
@@ -26,7 +26,7 @@ EPISODES = 2
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""
     folder = tmp_path_factory.mktemp("data") / "recorded"
-    return generate(GenerateConfig(DatasetTarget("test/recorded", folder), num_episodes=EPISODES))
+    return generate(GenerateConfig(RecordedDataset("test/recorded", folder), num_episodes=EPISODES))
 
 
 @pytest.fixture(scope="session")

@@ -68,6 +68,25 @@ def test_a_second_run_redoes_nothing(tiny_demo):
     assert (folder / "stages.json").read_text() == record
 
 
+def test_a_checkpoint_is_evaluated_on_several_tasks_at_once(tiny_demo, tmp_path):
+    checkpoint = tiny_demo.output_dir / "policy" / "checkpoints" / "last" / "pretrained_model"
+    result = run(
+        "lerobot-eval",
+        f"--policy.path={checkpoint}",
+        "--policy.device=cpu",
+        "--env.type=symview",
+        "--env.task=block_picking,drawer_opening",
+        "--env.max_steps=3",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        f"--output_dir={tmp_path}",
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    evaluation = json.loads((tmp_path / "eval_info.json").read_text())
+    assert sorted(evaluation["per_group"]) == ["block_picking", "drawer_opening"]
+    assert evaluation["overall"]["n_episodes"] == 4
+
+
 def test_lerobots_commands_list_our_options():
     train = run("lerobot-train", "--policy.type=symview_bc", "--help")
     for option in ("--policy.view", "--policy.crop_size", "--policy.rotation_augmentation"):

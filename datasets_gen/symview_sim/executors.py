@@ -14,7 +14,6 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from lerobot_symview.cli import CommandError, quiet
-from lerobot_symview.names import lookup
 
 
 class Executor(Protocol):
@@ -121,13 +120,10 @@ class RayExecutor:
         self._ray.shutdown()
 
 
-def make_executor(kind: str, num_workers: int) -> Executor:
-    """Return the executor `kind` (`local` or `ray`) with `num_workers` processes."""
-    makers: dict[str, Callable[[], Executor]] = {
-        "local": lambda: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers),
-        "ray": lambda: RayExecutor(num_workers),
-    }
-    return lookup("executor", kind, makers)()
+EXECUTORS: dict[str, Callable[[int], Executor]] = {
+    "local": lambda num_workers: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers),
+    "ray": RayExecutor,
+}
 
 
 def _start_worker() -> None:

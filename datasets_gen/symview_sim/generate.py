@@ -17,8 +17,9 @@ from lerobot_symview import keys
 from lerobot_symview.camera import project
 from lerobot_symview.cli import CommandError, DatasetTarget, run_command
 from lerobot_symview.features import Features, camera_features
+from lerobot_symview.names import lookup
 from symview_sim.env import SymviewEnv
-from symview_sim.executors import make_executor
+from symview_sim.executors import EXECUTORS
 from symview_sim.recording import (
     MAX_VIDEO_DEPTH,
     Recording,
@@ -48,7 +49,7 @@ class RecordedEnv(EnvSettings):
 
 @dataclass(frozen=True)
 class RecordedDataset(DatasetTarget):
-    """Where a new dataset goes."""
+    """Where a recording goes."""
 
     repo_id: str = "symview/demonstrations"
     """`user/name`, its name on the Hub."""
@@ -58,7 +59,7 @@ class RecordedDataset(DatasetTarget):
 class GenerateConfig:
     """Let a task's expert demonstrate it and record what the cameras see."""
 
-    dataset: RecordedDataset | DatasetTarget = field(default_factory=RecordedDataset)
+    dataset: RecordedDataset = field(default_factory=RecordedDataset)
     """Where the dataset goes; `--root` is short for `--dataset.root`."""
     env: RecordedEnv = field(default_factory=RecordedEnv)
     """What is demonstrated, and which cameras see it."""
@@ -87,6 +88,7 @@ class GenerateConfig:
             raise ValueError(f"--seed must not be negative, got {self.seed}")
         if not 0 <= self.noise <= 1:
             raise ValueError(f"--noise must lie in [0, 1], got {self.noise}")
+        lookup("--executor", self.executor, EXECUTORS)
         if self.num_workers < 1:
             raise ValueError(f"--num_workers must be at least 1, got {self.num_workers}")
 
@@ -103,7 +105,7 @@ def generate(config: GenerateConfig) -> Path:
     _open(recording, config.resume)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
-    with make_executor(config.executor, config.num_workers) as executor:
+    with EXECUTORS[config.executor](config.num_workers) as executor:
         with tqdm(desc=config.env.task, total=config.num_episodes, initial=len(attempts), unit="episode") as bar:
             done, tried = len(attempts), sum(attempts.values())
             for taken in executor.run(partial(record_episode, recording), missing):

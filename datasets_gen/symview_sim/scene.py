@@ -12,8 +12,9 @@ import pybullet_data
 from lerobot_symview.camera import Array
 from lerobot_symview.names import lookup
 from lerobot_symview.workspace import Workspace
+from symview_sim.arm import Arm
 from symview_sim.bullet import connect, disconnect, pybullet
-from symview_sim.robots import ROBOTS, Arm
+from symview_sim.robots import ROBOTS
 from symview_sim.shapes import Part, Vector
 
 GRAVITY = -9.81

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_symview.names import lookup
 from lerobot_symview.placement import CameraSpec
+from symview_sim.robots import ROBOTS
 from symview_sim.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ class EnvSettings:
     task: str = "block_picking"
     """Which task."""
     robot: str = "panda"
-    """Which arm."""
+    """Which arm, `panda` or `kuka`."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """Where the camera stands."""
     more_cameras: tuple[CameraSpec, ...] = ()
@@ -38,6 +39,7 @@ class EnvSettings:
 
     def __post_init__(self) -> None:
         lookup("task", self.task, dict.fromkeys(TASK_NAMES))
+        lookup("robot", self.robot, ROBOTS)
         if self.start_jitter < 0:
             raise ValueError(f"--env.start_jitter must not be negative, got {self.start_jitter}")
         if self.max_steps < 1:

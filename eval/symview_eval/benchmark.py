@@ -14,9 +14,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_symview.cli import USAGE, DatasetTarget, run_command
+from lerobot_symview.cli import USAGE, run_command
 from lerobot_symview.names import lookup
-from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from symview_sim.settings import EnvSettings
 from symview_sim.tasks import TASK_NAMES
 
@@ -154,7 +154,7 @@ def _saved_per_second(config: EnvBenchmark) -> float:
 
     recorded = RecordedEnv(**(vars(config.env) | {"oracle": config.env.oracle}))
     with tempfile.TemporaryDirectory() as folder:
-        target = DatasetTarget("benchmark/recorded", Path(folder) / "recorded")
+        target = RecordedDataset("benchmark/recorded", Path(folder) / "recorded")
         start = time.perf_counter()
         generate(GenerateConfig(target, env=recorded, num_episodes=config.episodes))
         return config.episodes / (time.perf_counter() - start)

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot.envs.utils import preprocess_observation
+
+from lerobot_policy_symview import SymviewEnvConfig
+from lerobot_symview.placement import CameraSpec
+from symview_sim import TASK_NAMES
+from symview_sim.env import SymviewEnv
+
+SMALL = CameraSpec(height=32, width=48)
+
+
+def test_the_declared_features_are_those_of_a_recording(recorded):
+    declared = SymviewEnvConfig(oracle=True).features
+    stored = LeRobotDataset("test/recorded", root=recorded).meta.features
+    for key, feature in declared.items():
+        assert tuple(stored[key]["shape"]) == feature.shape
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"oracle": True},
+        {"segmentation": True},
+        {"depth": False},
+        {"more_cameras": (CameraSpec("left", 24, 32, azimuth_deg=90.0),)},
+    ],
+    ids=str,
+)
+def test_observations_are_what_is_declared(options):
+    config = SymviewEnvConfig(camera=SMALL, **options)
+    env = config.create_envs(1)["block_picking"][0]
+    observation, _ = env.reset(seed=0)
+    batch = preprocess_observation(observation)
+    visual = {key: feature.shape for key, feature in config.features.items() if feature.type == "VISUAL"}
+    assert {key for key in batch if ".images." in key} == set(visual)
+    for key, (height, width, channels) in visual.items():
+        assert tuple(batch[key].shape) == (1, channels, height, width)
+    env.close()
+
+
+def test_views_are_added_before_the_policy_sees_an_observation():
+    config = SymviewEnvConfig(camera=SMALL, views=["reproj", "persp"], view_size=40)
+    env = config.create_envs(1)["block_picking"][0]
+    processor, _ = config.get_env_processors()
+    batch = processor(preprocess_observation(env.reset(seed=0)[0]))
+    for name, channels in {"reproj": 3, "reproj_height": 1, "persp": 3, "persp_gripper": 3}.items():
+        key = f"observation.images.side_{name}"
+        assert tuple(batch[key].shape) == (1, channels, 40, 40)
+        assert config.features[key].shape == (40, 40, channels)
+    env.close()
+
+
+def test_a_view_that_needs_depth_is_refused_without_it():
+    with pytest.raises(ValueError, match="'reproj' needs depth"):
+        SymviewEnvConfig(depth=False, views=["reproj"])
+
+
+def test_all_tasks_or_a_list_are_one_suite():
+    suite = SymviewEnvConfig(task="all", camera=SMALL).create_envs(2)
+    assert set(suite) == set(TASK_NAMES)
+    assert {env.num_envs for group in suite.values() for env in group.values()} == {2}
+    several = SymviewEnvConfig(task="block_picking, drawer_opening", camera=SMALL).create_envs(1)
+    assert list(several) == ["block_picking", "drawer_opening"]
+    with pytest.raises(ValueError, match="did you mean 'drawer_opening'"):
+        SymviewEnvConfig(task="block_picking, drawer_open").create_envs(1)
+
+
+def test_environments_in_processes_of_their_own_see_the_same_and_freeze_when_done():
+    config = SymviewEnvConfig(camera=SMALL)
+    asynchronous = config.create_envs(2, use_async_envs=True)["block_picking"][0]
+    expected = [SymviewEnv("block_picking", cameras=(SMALL,)) for _ in range(2)]
+    seen, _ = asynchronous.reset(seed=[5, 6])
+    shown = [env.reset(seed=seed)[0] for env, seed in zip(expected, (5, 6), strict=True)]
+    still = np.array([0, 0, 0, 0, 1], dtype=np.float32)
+    for step in range(9):  # the first succeeds after seven, the second does not move
+        for i in range(2):
+            np.testing.assert_array_equal(seen["pixels"]["side"][i], shown[i]["pixels"]["side"])
+            np.testing.assert_array_equal(seen["agent_pos"][i], shown[i]["agent_pos"])
+        done = step >= 7
+        action = still if done else expected[0].expert_action()
+        seen, reward, terminated, _, _ = asynchronous.step(np.stack([action, still]))
+        shown = [shown[0] if done else expected[0].step(action)[0], expected[1].step(still)[0]]
+        assert reward.tolist() == [float(step == 6), 0.0]
+        assert not terminated[1]
+    asynchronous.close()
