@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.camera import Camera
+from lerobot_symview.names import lookup
 from lerobot_symview.placement import CameraSpec, top_camera
 from lerobot_symview.workspace import Workspace
 from symview_sim.depth_sensor import degrade
 from symview_sim.motions import MAX_STEP, MAX_TURN
 from symview_sim.rendering import Picture, render
+from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from symview_sim.tasks import make_task
 
@@ -76,6 +78,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._max_episode_steps = max_steps
         self._start_jitter = start_jitter
+        lookup("robot", robot, ROBOTS)
         self._robot = robot
         self.specs = (*cameras, top_camera(cameras[0].height, self.workspace)) if oracle else tuple(cameras)
         names = [spec.name for spec in self.specs]
