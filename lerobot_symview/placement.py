@@ -19,7 +19,7 @@ class CameraSpread:
     """How far a camera's pose may be, at most, from the stated one; drawn anew and uniformly for every episode."""
 
     elevation_deg: float = 0.0
-    """Degrees."""
+    """Degrees, within 1 to 90 degrees above the table."""
     azimuth_deg: float = 0.0
     """Degrees; 180 draws from everywhere around the table."""
     distance: float = 0.0
@@ -80,6 +80,8 @@ class CameraSpec:
             problems.append(f"world_from_cam must be 16 numbers, got {len(self.world_from_cam)}")
         if self.world_from_cam is not None and self.varies:
             problems.append("spread needs a pose by angles, not world_from_cam")
+        if self.spread.distance >= self.distance:
+            problems.append(f"spread.distance must be smaller than distance, got {self.spread.distance:g}")
         if self.depth_noise < 0 or not 0 <= self.depth_dropout <= 1:
             problems.append("depth_noise must not be negative and depth_dropout must lie in [0, 1]")
         if problems:
@@ -113,7 +115,7 @@ class CameraSpec:
         if visible < minimum_visible:
             raise ValueError(
                 f"camera {self.name!r} sees {visible:.0%} of the workspace, expected at least {minimum_visible:.0%}: "
-                "raise its distance or fov_deg, or turn it towards the workspace"
+                "raise its distance or fov_deg, turn it towards the workspace, or lower its spread"
             )
         return camera
 
@@ -123,10 +125,10 @@ class CameraSpec:
 
     def _drawn(self, rng: np.random.Generator) -> CameraSpec:
         spread = self.spread
-        elevation = self.elevation_deg + rng.uniform(-spread.elevation_deg, spread.elevation_deg)
+        lowest = max(self.elevation_deg - spread.elevation_deg, min(1.0, self.elevation_deg))
         return replace(
             self,
-            elevation_deg=float(np.clip(elevation, 1.0, 90.0)),
+            elevation_deg=rng.uniform(lowest, min(self.elevation_deg + spread.elevation_deg, 90.0)),
             azimuth_deg=self.azimuth_deg + rng.uniform(-spread.azimuth_deg, spread.azimuth_deg),
             distance=self.distance + rng.uniform(-spread.distance, spread.distance),
             target=tuple(np.asarray(self.target) + rng.uniform(-spread.target, spread.target, size=3)),

@@ -35,14 +35,16 @@ def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) ->
         noise: standard deviation of a disturbance of every motion, as a fraction of the largest one.
 
     Raises:
-        CommandError: when ten attempts in a row fail, which an undisturbed expert's never do.
+        CommandError: when ten attempts in a row fail, which an undisturbed expert's never do in 50 steps.
     """
     env = _environment(settings)
     for attempt in range(ATTEMPTS):
         frames = _attempt(env, episode_seed(seed, episode, attempt), noise)
         if frames is not None:
             return {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}, attempt + 1
-    raise CommandError(f"the expert failed {ATTEMPTS} times in a row: lower --noise or --env.start_jitter")
+    raise CommandError(
+        f"the expert failed {ATTEMPTS} times in a row: lower --noise or --env.start_jitter, or raise --env.max_steps"
+    )
 
 
 @lru_cache(maxsize=1)

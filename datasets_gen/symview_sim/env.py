@@ -53,7 +53,8 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: `rgb_array` (or None); `render()` returns the first camera's view.
 
     Raises:
-        ValueError: two cameras of one name, or a camera that does not see the workspace.
+        ValueError: two cameras of one name, or of names such as `side` and `side_depth`, or a camera that does not see
+            the workspace.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 3}  # noqa: RUF012  gymnasium's own form
@@ -84,10 +85,16 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         names = [spec.name for spec in self.specs]
         if len(set(names)) < len(names):
             raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
+        for name in names:
+            longer = [other for other in names if other.startswith(f"{name}_")]
+            if longer:
+                raise ValueError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
         self._depth, self._segmentation = depth, segmentation
         self._scene: Scene | None = None
         self._steps = 0
+        corners = self.workspace.corners()
+        self._reach = [np.append(corner[:2], z) for corner, z in zip(corners[[0, 2]], GRIPPER_HEIGHTS, strict=True)]
         limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
         self._action_low, self._action_high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         self.action_space = gymnasium.spaces.Box(self._action_low, self._action_high)
@@ -105,7 +112,8 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         self._steps = 0
         jitter = self.np_random.uniform(-self._start_jitter, self._start_jitter, size=3)
-        self.scene.reset(np.array([*self.workspace.center, START_HEIGHT]) + jitter, gripper_yaw=0.0)
+        start = np.array([*self.workspace.center, START_HEIGHT]) + jitter
+        self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
         self._task.spawn(self.scene, self.np_random)
         self.scene.settle()
         pose_rng, self._sensor_rng = self.np_random.spawn(2)  # what is seen does not change what happens
@@ -116,10 +124,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Move the gripper by `action` (5,), clamped to the action space."""
         arm = self.scene.arm
         *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
-        half = self.workspace.size / 2
-        low = (self.workspace.center[0] - half, self.workspace.center[1] - half, GRIPPER_HEIGHTS[0])
-        high = (self.workspace.center[0] + half, self.workspace.center[1] + half, GRIPPER_HEIGHTS[1])
-        arm.move(np.clip(arm.position + motion[:3], low, high), arm.yaw + motion[3], aperture)
+        arm.move(np.clip(arm.position + motion[:3], *self._reach), arm.yaw + motion[3], aperture)
         self._steps += 1
         success = bool(self._task.is_success(self.scene))
         terminated = success or not self._task.is_valid(self.scene)

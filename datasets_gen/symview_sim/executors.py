@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -61,17 +62,13 @@ class ProcessExecutor:
         Raises:
             CommandError: if a process dies.
         """
-        return self._results([self._pool.submit(function, argument) for argument in arguments])
+        with _worker_deaths():
+            return self._results([self._pool.submit(function, argument) for argument in arguments])
 
     def _results[R](self, futures: list[Future[R]]) -> Iterator[R]:
-        try:
+        with _worker_deaths():
             for future in as_completed(futures):
                 yield future.result()
-        except BrokenProcessPool:
-            raise CommandError(
-                "a worker process died, perhaps for lack of memory: repeat the command with --resume=true "
-                "and a smaller --num_workers"
-            ) from None
 
     def __enter__(self) -> Self:
         return self
@@ -112,6 +109,8 @@ class RayExecutor:
                 yield self._ray.get(done[0])
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
+        except self._ray.exceptions.RayError as error:
+            raise CommandError(f"the Ray cluster failed, repeat the command with --resume=true: {error}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -124,6 +123,17 @@ EXECUTORS: dict[str, Callable[[int], Executor]] = {
     "local": lambda num_workers: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers),
     "ray": RayExecutor,
 }
+
+
+@contextmanager
+def _worker_deaths() -> Iterator[None]:
+    try:
+        yield
+    except BrokenProcessPool:
+        raise CommandError(
+            "a worker process died, perhaps for lack of memory: repeat the command with --resume=true "
+            "and a smaller --num_workers"
+        ) from None
 
 
 def _start_worker() -> None:

@@ -75,7 +75,7 @@ class GenerateConfig:
     """Store images as video: colour without loss, depth up to 1.6 m with an error below 0.2 mm. The oracle's depth,
     which is farther, stays images. Smaller on disk, several times slower to train from."""
     num_workers: int = 1
-    """Processes that simulate and write. Their number does not change the data."""
+    """Processes that simulate and write, unless RAY_ADDRESS names a cluster. Their number does not change the data."""
     executor: str = "local"
     """`local`, or `ray`: the cluster that RAY_ADDRESS names, whose machines see the same folders, or a local one."""
     resume: bool = False
@@ -99,6 +99,7 @@ def generate(config: GenerateConfig) -> Path:
     recording = _plan(config, target)
     if target.exists():
         if config.resume and _description(target / "meta" / "symview_recording.json") == recording.description():
+            shutil.rmtree(recording.folder, ignore_errors=True)
             logger.info("%s is complete already", target)
             return target
         raise CommandError(f"{target} exists already: choose another --dataset.root or remove it")
@@ -126,7 +127,7 @@ def generate(config: GenerateConfig) -> Path:
 def _plan(config: GenerateConfig, target: Path) -> Recording:
     env = config.env.make()
     if config.video:
-        _check_video_depth(env)
+        _check_video_depth(env, config.env.oracle)
     recording = Recording(
         folder=target.with_name(target.name + ".partial"),
         repo_id=config.dataset.repo_id,
@@ -159,8 +160,10 @@ def _open(recording: Recording, resume: bool) -> None:
                 "repeat the command that began it, or remove it"
             )
         return
+    if recording.folder.exists():  # what a clean-up that was interrupted left behind
+        shutil.rmtree(recording.folder)
     for part in ("episodes", "shards"):
-        (recording.folder / part).mkdir(parents=True, exist_ok=True)
+        (recording.folder / part).mkdir(parents=True)
     part_file = file.with_suffix(".part")
     part_file.write_text(json.dumps(recording.description()))
     part_file.replace(file)
@@ -170,12 +173,17 @@ def _description(file: Path) -> dict[str, object]:
     return json.loads(file.read_text()) if file.exists() else {}
 
 
-def _check_video_depth(env: SymviewEnv) -> None:
+def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:
     """Raise ValueError if a camera sees a part of the workspace from farther than the video's depth reaches."""
-    corners = np.concatenate([env.workspace.corners(), env.workspace.corners(env.workspace.height_limit)])
-    for spec in env.specs:
-        farthest = project(corners, env.cameras[spec.name])[1].max() + spec.spread.distance + 2 * spec.spread.target
-        if spec.name != "top" and farthest > MAX_VIDEO_DEPTH:
+    half, height = env.workspace.size / 2, env.workspace.height_limit
+    corners = np.concatenate([env.workspace.corners(), env.workspace.corners(height)])
+    for spec in env.specs[: -1 if oracle else None]:
+        if spec.varies:  # from wherever it is drawn, the farthest corner is no farther than this
+            farthest = spec.distance + spec.spread.distance + 2 * spec.spread.target
+            farthest += float(np.linalg.norm(spec.target) + np.linalg.norm([half, half, height]))
+        else:
+            farthest = project(corners, env.cameras[spec.name])[1].max()
+        if farthest > MAX_VIDEO_DEPTH:
             raise ValueError(
                 f"camera {spec.name!r} sees the workspace from up to {farthest:.2f} m, --video=true stores depth up to "
                 f"{MAX_VIDEO_DEPTH} m: bring it nearer or leave --video=false"
@@ -205,7 +213,7 @@ def _features(env: SymviewEnv, config: GenerateConfig) -> Features:
         features |= camera_features(spec.name, spec.height, spec.width, placement, **shown)
     if config.video:
         for key, feature in features.items():
-            if feature["dtype"] == "image" and key != keys.depth("top"):
+            if feature["dtype"] == "image" and not (config.env.oracle and key == keys.depth("top")):
                 feature["dtype"] = "video"
     return features
 

@@ -11,6 +11,7 @@ killed at any moment loses the episodes it was simulating and no others.
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import logging
@@ -20,6 +21,7 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -56,7 +58,7 @@ class Recording:
         return self.folder / "episodes" / f"{episode:06d}.npz"
 
     def shards(self) -> list[range]:
-        """Return the episodes of every shard: 25 or more each, at most 32 shards, whoever writes them."""
+        """Return the episodes of every shard: 25 each, or more where that gives over 32 shards, whoever writes them."""
         size = max(SHARD_EPISODES, -(-self.num_episodes // MAX_SHARDS))
         return [range(first, min(first + size, self.num_episodes)) for first in range(0, self.num_episodes, size)]
 
@@ -75,11 +77,12 @@ def record_episode(recording: Recording, episode: int) -> int:
     """Simulate an episode and keep it; return how many attempts it took."""
     frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
     file = recording.episode_file(episode)
-    part = file.with_suffix(".part")
+    part = _part_of(file)
+    content: dict[str, Any] = {**frames, ATTEMPTS_KEY: attempts}
     try:
         with _disk_errors(recording.folder):
             with part.open("wb") as stream:
-                np.savez(stream, allow_pickle=False, **frames, **{ATTEMPTS_KEY: attempts})
+                np.savez(stream, **content)
             part.replace(file)
     finally:
         part.unlink(missing_ok=True)
@@ -100,9 +103,7 @@ def write_shard(recording: Recording, shard: range) -> Path:
     folder = recording.shard_folder(shard)
     if folder.exists():
         return folder
-    part = folder.with_suffix(".part")
-    if part.exists():
-        shutil.rmtree(part)
+    part = _part_of(folder)
     with _disk_errors(recording.folder), _failed_images() as failures:
         dataset = _create_dataset(recording, part)
         for episode in shard:
@@ -113,7 +114,8 @@ def write_shard(recording: Recording, shard: range) -> Path:
             dataset.save_episode(parallel_encoding=False)
         dataset.finalize()
         shutil.rmtree(part / "images")  # LeRobot leaves its empty scratch folders behind
-        part.rename(folder)
+        if not folder.exists():  # a cluster that lost sight of a worker has its work done twice
+            part.rename(folder)
     return folder
 
 
@@ -141,6 +143,11 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
         _complete_metadata(joined, len(attempts) / sum(attempts.values()))
         (joined / "meta" / "symview_recording.json").write_text(json.dumps(recording.description(), indent=4))
     return joined
+
+
+def _part_of(path: Path) -> Path:
+    """Return a name beside `path`, used by nobody else, for what is not complete yet."""
+    return path.with_name(f"{path.name}.{uuid4().hex}.part")
 
 
 def _create_dataset(recording: Recording, root: Path) -> Any:
@@ -212,7 +219,8 @@ def _disk_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         free = shutil.disk_usage(folder).free / 2**20
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         raise CommandError(
-            f"cannot write to {folder} ({free:.0f} MiB free): {error}. "
-            "Make room and repeat the command with --resume=true: what is finished is kept"
+            f"cannot write to {folder} ({free:.0f} MiB free): {error}. {'Make room and repeat' if full else 'Repeat'} "
+            "the command with --resume=true: what is finished is kept"
         ) from None

@@ -12,6 +12,7 @@ from lerobot_symview.camera import Array, Camera, invert_rigid
 from symview_sim.bullet import pybullet
 
 NEAR, FAR = 0.05, 4.0  # metres, clipping planes
+SCENE, SCENE_RADIUS = np.array([0.45, 0.0, 0.0]), 1.5  # metres: objects and arm lie within
 TILE = 0.1  # metres, side of the table's squares
 TILE_COLORS = np.array([[206, 200, 190], [188, 182, 172]], dtype=np.uint8)
 SKY = np.array([235, 240, 245], dtype=np.uint8)
@@ -42,8 +43,9 @@ def render(client: Any, camera: Camera) -> Picture:
         camera: where to look from.
     """
     near, far = NEAR, FAR
-    if camera.position[2] > FAR:  # a distant camera spends its depth range on the scene
-        near, far = camera.position[2] - 1.0, camera.position[2] + 0.5
+    distance = float(np.linalg.norm(camera.position - SCENE))
+    if distance + SCENE_RADIUS > FAR:  # a distant camera spends its depth range on the scene
+        near, far = distance - SCENE_RADIUS, distance + SCENE_RADIUS
     _, _, rgba, zbuffer, mask = client.getCameraImage(
         camera.width,
         camera.height,
@@ -68,7 +70,7 @@ def render(client: Any, camera: Camera) -> Picture:
     return Picture(rgb, depth, labels)
 
 
-@lru_cache(maxsize=16)  # a camera mostly stays where it is
+@lru_cache(maxsize=64)  # a camera mostly stays where it is
 def _table(camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Colour (H, W, 3) and depth (H, W) of an infinite chequered table; its tiles are symmetric about x = 0.45."""
     rotation, position = camera.world_from_cam[:3, :3], camera.position

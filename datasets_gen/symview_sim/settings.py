@@ -46,7 +46,7 @@ class EnvSettings:
             raise ValueError(f"--env.max_steps must be at least 1, got {self.max_steps}")
 
     def make(self) -> SymviewEnv:
-        """Return the environment; this starts PyBullet."""
+        """Return the environment; this imports PyBullet."""
         from symview_sim.env import SymviewEnv
 
         return SymviewEnv(

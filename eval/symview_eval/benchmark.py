@@ -152,7 +152,7 @@ class _Timed:
 def _saved_per_second(config: EnvBenchmark) -> float:
     import lerobot.datasets  # noqa: F401  imported before the clock starts: it takes longer than the writing
 
-    recorded = RecordedEnv(**(vars(config.env) | {"oracle": config.env.oracle}))
+    recorded = RecordedEnv(**vars(config.env))
     with tempfile.TemporaryDirectory() as folder:
         target = RecordedDataset("benchmark/recorded", Path(folder) / "recorded")
         start = time.perf_counter()

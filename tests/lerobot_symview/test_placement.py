@@ -42,6 +42,20 @@ def test_a_negative_spread_is_refused():
         CameraSpread(distance=-0.1)
 
 
+def test_a_spread_as_large_as_the_distance_is_refused():
+    with pytest.raises(ValueError, match=r"spread\.distance must be smaller than distance"):
+        CameraSpec(spread=CameraSpread(distance=0.9))
+
+
+def test_elevations_are_drawn_uniformly_below_the_zenith(workspace):
+    spec = CameraSpec(elevation_deg=80.0, spread=CameraSpread(elevation_deg=30.0))
+    rng = np.random.default_rng(0)
+    poses = [spec.place(workspace, rng).position - [*workspace.center, 0.0] for _ in range(200)]
+    elevations = np.rad2deg(np.arcsin([pose[2] / np.linalg.norm(pose) for pose in poses]))
+    assert (np.histogram(elevations, bins=4, range=(50.0, 90.0))[0] > 30).all()
+    assert len(set(elevations)) == 200
+
+
 def test_a_pose_by_matrix_cannot_spread():
     with pytest.raises(ValueError, match="spread needs a pose by angles"):
         CameraSpec(world_from_cam=tuple(np.eye(4).ravel()), spread=SPREAD)

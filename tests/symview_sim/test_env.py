@@ -111,6 +111,26 @@ def test_noise_is_in_the_depth_alone_and_new_in_every_frame():
     assert not np.array_equal(depths[1][0], depths[1][1])
 
 
+def test_a_distant_camera_sees_arm_and_objects():
+    far = CameraSpec(distance=6.0, elevation_deg=30.0, fov_deg=6.0)
+    env = SymviewEnv("block_picking", cameras=(far,), segmentation=True)
+    pixels = env.reset(seed=0)[0]["pixels"]
+    counts = np.bincount(pixels["side_segmentation"][..., 0].ravel(), minlength=3)
+    assert (counts[1:] > 100).all()
+
+
+def test_the_start_stays_within_reach_however_large_the_jitter():
+    env = SymviewEnv("block_picking", cameras=(), start_jitter=0.5)
+    heights = [env.reset(seed=seed)[0]["agent_pos"][2] for seed in range(10)]
+    assert min(heights) > 0.015
+    assert max(heights) < 0.255
+
+
+def test_a_camera_named_like_anothers_depth_is_refused():
+    with pytest.raises(ValueError, match="'side_depth' is named like depth or a view of camera 'side'"):
+        SymviewEnv("block_picking", cameras=(SIDE, replace(LEFT, name="side_depth")))
+
+
 def test_two_cameras_of_one_name_are_refused():
     with pytest.raises(ValueError, match="differ in their names, got side, side"):
         SymviewEnv("block_picking", cameras=(SIDE, SIDE))

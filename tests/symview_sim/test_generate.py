@@ -146,9 +146,11 @@ def test_video_keeps_colour_exactly_and_depth_to_a_fifth_of_a_millimetre(tmp_pat
 
 
 def test_a_camera_too_far_away_for_video_depth_is_refused(tmp_path):
-    env = RecordedEnv(camera=CameraSpec(distance=1.6, fov_deg=25.0))
-    with pytest.raises(ValueError, match="video=true stores depth up to"):
-        generate(config(tmp_path / "data", env=env, video=True))
+    far = CameraSpec(distance=1.6, fov_deg=25.0)
+    sometimes_far = CameraSpec(distance=1.42, fov_deg=30.0, spread=CameraSpread(azimuth_deg=180.0))
+    for camera in (far, sometimes_far):
+        with pytest.raises(ValueError, match="video=true stores depth up to"):
+            generate(config(tmp_path / "data", env=RecordedEnv(camera=camera), video=True))
 
 
 def test_the_number_of_workers_does_not_change_the_data(reference, tmp_path):
@@ -193,6 +195,14 @@ def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tm
         generate(config(tmp_path / "data", seed=1, resume=True))
     with pytest.raises(CommandError, match="differs in env, features"):
         generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
+
+
+def test_what_an_interrupted_clean_up_left_is_not_adopted(small_shards, tmp_path):
+    plan = _begun(tmp_path)
+    (plan.folder / "recording.json").unlink()
+    folder = generate(config(tmp_path / "data", num_episodes=1, seed=1))
+    starts = LeRobotDataset("test/small", root=folder)[0][keys.ACTION].numpy()
+    np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0)[0][keys.ACTION][0])
 
 
 def test_resuming_what_is_complete_does_nothing(reference):
