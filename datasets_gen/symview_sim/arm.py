@@ -151,10 +151,11 @@ class Arm:
 
     def _solve(self, position: ArrayLike, yaw: float) -> list[float]:
         """Return the arm's joint angles, rad, that bring the gripper to `position` (3,), its yaw up to half a turn."""
-        turn = nearest_turn(self._heading, yaw, period=np.pi)
+        heading = self._heading
+        turn = nearest_turn(heading, yaw, period=np.pi)
         lower, upper = self._wrist_limits
         for half_turn in (0.0, -np.copysign(np.pi, turn)):  # back, where the near way leads past the wrist's limits
-            *arm, wrist = self._inverse_kinematics(position, self._heading + turn + half_turn)
+            *arm, wrist = self._inverse_kinematics(position, heading + turn + half_turn)
             wrist = (wrist + np.pi) % (2 * np.pi) - np.pi
             if lower <= wrist <= upper:
                 break

@@ -77,9 +77,9 @@ def _attempt(env: SymviewEnv, seed: int, noise: float) -> list[dict[str, NDArray
 
 def _features(observation: dict[str, Any]) -> dict[str, NDArray[Any]]:
     """Name what was observed as LeRobot does."""
-    features = {f"observation.{key}": value for key, value in observation.items() if key not in ("agent_pos", "pixels")}
-    features = {
-        key: value[0, ..., None] if value.ndim == 3 else value for key, value in features.items()
-    }  # channel last
+    features = {keys.STATE: observation["agent_pos"]}
     features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
-    return {keys.STATE: observation["agent_pos"]} | features
+    for key in observation.keys() - {"agent_pos", "pixels"}:
+        value = observation[key]
+        features[f"observation.{key}"] = value[0, ..., None] if value.ndim == 3 else value  # depth: channel last
+    return features

@@ -79,8 +79,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._max_episode_steps = max_steps
         self._start_jitter = start_jitter
-        lookup("robot", robot, ROBOTS)
-        self._robot = robot
+        self._robot = lookup("robot", robot, ROBOTS)
         self.specs = (*cameras, top_camera(cameras[0].height, self.workspace)) if oracle else tuple(cameras)
         names = [spec.name for spec in self.specs]
         if len(set(names)) < len(names):

@@ -10,11 +10,10 @@ import numpy as np
 import pybullet_data
 
 from lerobot_symview.camera import Array
-from lerobot_symview.names import lookup
 from lerobot_symview.workspace import Workspace
 from symview_sim.arm import Arm
 from symview_sim.bullet import connect, disconnect, pybullet
-from symview_sim.robots import ROBOTS
+from symview_sim.robots import RobotSpec
 from symview_sim.shapes import Part, Vector
 
 GRAVITY = -9.81
@@ -31,11 +30,11 @@ class Scene:
     """One simulator, private to its owner: every call carries its client id, so scenes do not disturb each other.
 
     Args:
-        robot: name in `ROBOTS`.
+        robot: which arm.
         workspace: where the task takes place.
     """
 
-    def __init__(self, robot: str, workspace: Workspace):
+    def __init__(self, robot: RobotSpec, workspace: Workspace):
         self.client: Any = connect()
         self.client.setAdditionalSearchPath(pybullet_data.getDataPath())
         self._disconnect = weakref.finalize(self, disconnect, self.client)
@@ -44,7 +43,7 @@ class Scene:
         self.client.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
         ground = self.client.createMultiBody(0, self.client.createCollisionShape(pybullet.GEOM_PLANE))
         self.client.changeVisualShape(ground, -1, rgbaColor=[1, 1, 1, 0])
-        self.arm = Arm(self.client, lookup("robot", robot, ROBOTS))
+        self.arm = Arm(self.client, robot)
         self.arm.pass_through(ground)  # no arm reaches under the table; testing it takes a quarter of a step
         self._fixtures: int = self.client.getNumBodies()
         # The first step ever taken leaves traces in the solver. With it behind, episodes are bit-identical in whichever

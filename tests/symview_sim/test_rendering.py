@@ -3,6 +3,7 @@ import pytest
 
 from lerobot_symview.camera import project, unproject
 from symview_sim.rendering import render
+from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from tests.conftest import make_camera
 
@@ -13,7 +14,7 @@ BOX = np.array([0.30, 0.24, 0.04])
 def scene():
     from lerobot_symview.workspace import Workspace
 
-    scene = Scene("panda", Workspace())
+    scene = Scene(ROBOTS["panda"], Workspace())
     scene.reset(np.array([0.3, 0.0, 0.24]), 0.0)
     scene.add_box(BOX, 0.0, 1.0, (0.9, 0.1, 0.1), np.array([0.45, 0.0, 0.02]), 0.0)
     return scene
