@@ -15,8 +15,8 @@ from symview_sim.bullet import pybullet
 from symview_sim.motions import nearest_turn
 from symview_sim.robots import RobotSpec
 
-ARM_STEPS, GRIPPER_STEPS = 50, 25  # simulation steps at 1/240 s: 0.31 s an action
-RAMP_STEPS = 34  # of the arm's steps, in which its target moves to the goal; it settles in the others
+ARM_STEPS, GRIPPER_STEPS = 40, 25  # simulation steps at 1/240 s: 0.27 s an action
+RAMP_STEPS = 27  # of the arm's steps, in which its target moves to the goal; it settles in the others
 POSITION_GAIN = 0.2
 # Steel on wood. Grippier fingers jam on a cube's corners instead of turning it into line: at 1.0 a cube held 35 degrees
 # askew stays so, at 0.2 it slips out.

@@ -57,7 +57,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             the workspace.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 3}  # noqa: RUF012  gymnasium's own form
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  gymnasium's own form
 
     def __init__(
         self,

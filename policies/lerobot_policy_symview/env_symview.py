@@ -28,7 +28,7 @@ class SymviewEnvConfig(EnvConfig):
 
     task: str = "block_picking"
     """Which task, such as `block_picking`; several with commas between them, or `all`."""
-    fps: int = 3
+    fps: int = 4
     """Actions per second of a robot that takes as long as the simulated one."""
     robot: str = "panda"
     """Which arm, `panda` or `kuka`."""
