@@ -2,33 +2,44 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from dataclasses import dataclass, field
+import shutil
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.camera import Camera
-from lerobot_symview.cli import CommandError, DatasetTarget, run_command
-from lerobot_symview.features import Features, stored_workspace, view_features
-from lerobot_symview.staging import staged
-from lerobot_symview.views import Frame, View, make_view
-from lerobot_symview.workspace import Workspace
-
-if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
+from lerobot_symview.calibration import plain_calibration, read_calibration
+from lerobot_symview.camera import CalibrationError
+from lerobot_symview.cli import DatasetTarget, run_command
+from lerobot_symview.derivation import (
+    MADE_FROM,
+    Derivation,
+    cut_parts,
+    derived_schema,
+    finish,
+    source_fingerprint,
+    write_part,
+)
+from lerobot_symview.executors import EXECUTORS
+from lerobot_symview.features import Features, calibration_features, stored_workspace, view_features
+from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
+from lerobot_symview.workspace import check_visible
 
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """\
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/picking_views --views='[reproj, persp]'
   symview-add-views --dataset.repo_id=me/picking --dataset.root=data/picking \\
-      --new_repo_id=me/picking_reproj --new_root=data/picking_reproj --views='[reproj]' --size=76 --keep='[]'"""
+      --new_repo_id=me/picking_reproj --new_root=data/picking_reproj --views='[reproj]' --size=76 --keep='[]'
+  symview-add-views --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --num_workers=4 \\
+      --reproj.clip=0.15 --reproj.source_scale=2"""
 
 
 @dataclass(frozen=True)
@@ -36,7 +47,7 @@ class AddViewsConfig:
     """Write a dataset again with views from above as new camera keys. The source is not modified."""
 
     dataset: DatasetTarget
-    """The source: it must hold the camera's images and its calibration."""
+    """The source: it must hold the camera's images, and its calibration unless `calibration` states it."""
     new_repo_id: str = ""
     """Name of the result; by default that of the source with `_views` appended."""
     new_root: Path | None = None
@@ -45,19 +56,29 @@ class AddViewsConfig:
     """Which views to add: reproj (needs depth), persp."""
     camera: str = "side"
     """Camera they are made from."""
-    size: int = 152
-    """Rows and columns of the views."""
+    size: int | None = None
+    """Rows and columns of all views, in place of each one's own."""
+    reproj: ReprojectedView = field(default_factory=ReprojectedView)
+    """Options of the view reproj."""
+    persp: PerspectiveView = field(default_factory=PerspectiveView)
+    """Options of the view persp."""
+    calibration: Path | None = None
+    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/views.md."""
     keep: list[str] | None = None
-    """Source image keys to keep, without `observation.images.`; by default all. Calibration goes with its camera."""
+    """Source image keys to keep, without `observation.images.`; by default all. `[]` leaves the views alone."""
+    num_workers: int = 1
+    """Processes that make views side by side. The data does not depend on it."""
+    resume: bool = False
+    """Go on where an earlier run of the same command was interrupted."""
 
     def __post_init__(self) -> None:
-        if not self.views:
-            raise ValueError("--views is empty, name at least one view")
-        self.make_views()
+        if self.num_workers < 1:
+            raise ValueError(f"--num_workers must be at least 1, got {self.num_workers}")
+        self.chosen_views()
 
-    def make_views(self) -> dict[str, View]:
+    def chosen_views(self) -> dict[str, View]:
         """Return the views by name."""
-        return {name: make_view(name, size=self.size) for name in self.views}
+        return choose_views(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
 
     def target(self) -> DatasetTarget:
         """Return where the result goes."""
@@ -67,119 +88,106 @@ class AddViewsConfig:
 def add_views(config: AddViewsConfig) -> Path:
     """Write the dataset that `config` describes and return its folder.
 
-    Every frame's views are computed from its own calibration, so a camera may move. Original keys are copied bit for
-    bit; statistics cover the new keys.
+    Every frame's views are computed from its own calibration, so a camera may move. Original columns are copied bit for
+    bit and videos as files; statistics cover the new keys.
     """
-    source_folder, target = config.dataset.folder(), config.target().folder()
-    if not (source_folder / "meta" / "info.json").is_file():
-        raise CommandError(f"no dataset at {source_folder}: check --dataset.repo_id and --dataset.root")
-    with staged(target, "--new_root") as partial:
-        from lerobot.datasets import LeRobotDataset
-
-        source = LeRobotDataset(config.dataset.repo_id, root=source_folder, depth_output_unit="m")
-        features = source.meta.features
-        views, workspace = config.make_views(), stored_workspace(features)
-        _check_inputs(config, features, views)
-        added = {
-            key: feature
-            for name, view in views.items()
-            for key, feature in view_features(config.camera, name, view, workspace).items()
-        }
-        images = _render(source, config.camera, views, workspace)
-        _write(source, partial, config, added, images)
-        _write_stats(partial, added, images)
-    logger.info("wrote %d frames with %s to %s", len(images), ", ".join(views), target)
+    source, target = SourceDataset(config.dataset.folder()), config.target().folder()
+    derivation = _plan(config, source, partial_folder(target))
+    description = _description(config, derivation, source)
+    if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
+        logger.info("%s is complete already", target)
+        return target
+    _check_first_frame(derivation, source)
+    parts = cut_parts(source)
+    open_partial(derivation.folder, description, config.resume)
+    names = ", ".join(derivation.views)
+    with (
+        EXECUTORS["local"](config.num_workers) as executor,
+        tqdm(desc=names, total=source.info["total_frames"], unit="frame") as bar,
+    ):
+        for frames in executor.run(partial(write_part, derivation), list(enumerate(parts))):
+            bar.update(frames)
+    finish(derivation, parts, description).rename(target)
+    shutil.rmtree(derivation.folder)
+    logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
     return target
 
 
-def _check_inputs(config: AddViewsConfig, features: Features, views: dict[str, View]) -> None:
-    camera = config.camera
-    needed = [keys.rgb(camera), keys.intrinsics(camera), keys.world_from_cam(camera), keys.STATE]
-    if any(view.needs_depth for view in views.values()):
-        needed.append(keys.depth(camera))
-    missing = [key for key in needed if key not in features]
+def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:
+    calibration = read_calibration(config.calibration) if config.calibration else None
+    workspace = calibration.workspace if calibration is not None else None
+    workspace = workspace or stored_workspace(source.features)
+    views = config.chosen_views()
+    added: Features = {}
+    if calibration is not None:
+        check_visible(
+            config.camera, calibration.camera(config.camera), workspace, f"check the poses in {config.calibration}"
+        )
+        added |= calibration_features(config.camera)
+    for name, view in views.items():
+        added |= view_features(config.camera, name, view, workspace)
+    kept = None if config.keep is None else {keys.rgb(name) for name in config.keep}
+    dropped = [
+        key
+        for key, feature in source.features.items()
+        if feature["dtype"] in ("image", "video") and kept is not None and key not in kept
+    ]
+    schema = derived_schema(source, dropped, added)
+    derivation = Derivation(source.folder, folder, config.camera, views, workspace, calibration, dropped, added, schema)
+    _check_inputs(config, source.features, derivation.reader(source), added)
+    return derivation
+
+
+def _check_inputs(config: AddViewsConfig, features: Features, reader: FrameReader, added: Features) -> None:
+    missing = reader.missing()
     if missing:
         cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
-        raise ValueError(f"the dataset lacks {missing}; --camera={camera}, calibrated cameras: {cameras or 'none'}")
-    existing = [
-        key for name, view in views.items() for key in (keys.view(camera, o) for o in view.outputs) if key in features
-    ]
+        remedy = f"--camera={config.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
+        if reader.gripper:
+            remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
+        raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
+    existing = [key for key in added if key in features]
     if existing:
-        raise ValueError(f"the dataset has {existing} already: take them out of --views")
-    unknown = [name for name in config.keep or [] if keys.rgb(name) not in features]
+        raise ValueError(f"the dataset has {', '.join(existing)} already: take them out of --views or --calibration")
+    prefix = keys.rgb("")
+    images = sorted(key.removeprefix(prefix) for key in features if key.startswith(prefix))
+    unknown = sorted(set(config.keep or []) - set(images))
     if unknown:
-        known = sorted(key.removeprefix("observation.images.") for key in features if "observation.images." in key)
-        raise ValueError(f"--keep names {unknown}, which the dataset lacks; it has {known}")
+        raise ValueError(f"--keep names {', '.join(unknown)}, which the dataset lacks; it has {', '.join(images)}")
 
 
-def _render(
-    source: LeRobotDataset, camera: str, views: dict[str, View], workspace: Workspace
-) -> list[dict[str, NDArray[Any]]]:
-    frames = []
-    for index in tqdm(range(len(source)), desc=f"rendering {', '.join(views)}", unit="frame"):
-        item = source[index]
-        rgb = (item[keys.rgb(camera)] * 255).round().byte().permute(1, 2, 0).numpy()
-        depth = item[keys.depth(camera)][0].numpy() if keys.depth(camera) in item else None
-        frame = Frame(
-            rgb=rgb,
-            depth=depth,
-            camera=Camera(
-                item[keys.intrinsics(camera)].numpy().reshape(3, 3),
-                item[keys.world_from_cam(camera)].numpy().reshape(4, 4),
-                *rgb.shape[:2],
-            ),
-            workspace=workspace,
-            gripper=item[keys.STATE].numpy(),
-        )
-        images: dict[str, NDArray[Any]] = {}
-        for view in views.values():
-            images |= {keys.view(camera, output): image for output, image in view.render(frame).items()}
-        frames.append(images)
-    return frames
+def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
+    """Make the views once, so that what is wrong with all frames is said before anything is written."""
+    reader = derivation.reader(source)
+    frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
+    for view in derivation.views.values():
+        view.render(frame)
+    if derivation.calibration is None:
+        try:
+            check_visible(
+                derivation.camera, frame.camera, derivation.workspace, "views will be empty where it sees none"
+            )
+        except CalibrationError as error:
+            logger.warning("%s", error)
 
 
-def _write(
-    source: LeRobotDataset, folder: Path, config: AddViewsConfig, added: Features, images: list[dict[str, NDArray[Any]]]
-) -> None:
-    from lerobot.datasets import modify_features
-
-    dropped = []
-    if config.keep is not None:
-        kept = {keys.rgb(name) for name in config.keep}
-        dropped = [
-            key
-            for key, feature in source.meta.features.items()
-            if feature["dtype"] in ("image", "video") and key not in kept
-        ]
-
-    def value_of(key: str) -> Any:
-        return lambda row, episode, frame: images[int(row["index"])][key]
-
-    modify_features(
-        source,
-        add_features={key: (value_of(key), feature) for key, feature in added.items()},
-        remove_features=dropped or None,
-        output_dir=folder,
-        repo_id=config.target().repo_id,
+def _description(config: AddViewsConfig, derivation: Derivation, source: SourceDataset) -> dict[str, Any]:
+    """What determines the result."""
+    return plain(
+        {
+            "repo_id": config.target().repo_id,
+            "source": config.dataset.repo_id,
+            "source_files": source_fingerprint(source),
+            "camera": config.camera,
+            "views": {name: asdict(view) for name, view in derivation.views.items()},
+            "workspace": asdict(derivation.workspace),
+            "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
+            "left_out": derivation.dropped,
+            "symview": version("lerobot_policy_symview"),
+        }
     )
-
-
-def _write_stats(folder: Path, added: Features, images: list[dict[str, NDArray[Any]]]) -> None:
-    """Add the new keys' statistics, which LeRobot leaves out; without them `lerobot-train` fails on image keys."""
-    from lerobot.datasets.compute_stats import get_feature_stats
-
-    path = folder / "meta" / "stats.json"
-    stats = json.loads(path.read_text())
-    for key, feature in added.items():
-        is_color = feature["shape"][-1] == 3
-        stacked = np.stack([frame[key] for frame in images])
-        channels_first = stacked.transpose(0, 3, 1, 2) if is_color else stacked[:, None]
-        scaled = channels_first / 255.0 if is_color else channels_first.astype(np.float64)
-        values = get_feature_stats(scaled, axis=(0, 2, 3), keepdims=True)
-        stats[key] = {name: (value if name == "count" else value[0]).tolist() for name, value in values.items()}
-    path.write_text(json.dumps(stats, indent=4))
 
 
 def main() -> None:
     """Run the console command."""
-    run_command(AddViewsConfig, add_views, EXAMPLES)
+    run_command(AddViewsConfig, add_views, EXAMPLES, short={"--root": "--dataset.root"})

@@ -6,11 +6,13 @@ Axes are OpenCV's (x right, y down, z forward), integer pixel coordinates are pi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+MILLIMETRES_PER_METRE = 1000.0
 
 
 class CalibrationError(ValueError):
@@ -54,6 +56,43 @@ class Camera:
     def cam_from_world(self) -> Array:
         """(4, 4) inverse of `world_from_cam`."""
         return invert_rigid(self.world_from_cam)
+
+    def enlarged(self, factor: int) -> Camera:
+        """Return the camera that sees the same with `factor` times the rows and columns."""
+        intrinsics = self.intrinsics * [[factor], [factor], [1]]
+        intrinsics[:2, 2] += (factor - 1) / 2  # integer coordinates are pixel centres
+        return Camera(intrinsics, self.world_from_cam, factor * self.height, factor * self.width)
+
+
+def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, width: int) -> Camera:
+    """Return the camera whose matrices a dataset or an observation holds.
+
+    Args:
+        intrinsics: (9,) or (3, 3), K in pixels.
+        world_from_cam: (16,) or (4, 4), metres.
+        height: image rows.
+        width: image columns.
+
+    Returns:
+        The same object for the same numbers, so that what depends on the camera alone can be kept with it.
+
+    Raises:
+        CalibrationError: as `Camera`.
+    """
+    matrices = (np.asarray(matrix, dtype=np.float64).tobytes() for matrix in (intrinsics, world_from_cam))
+    return _camera(*matrices, height, width)
+
+
+@lru_cache(maxsize=256)
+def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int) -> Camera:
+    return Camera(np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(world_from_cam).reshape(4, 4), height, width)
+
+
+def depth_in_metres(depth: NDArray) -> NDArray[np.floating]:
+    """Return depth in metres: floating-point depth is in metres already, integers (a RealSense's) are millimetres."""
+    if np.issubdtype(depth.dtype, np.floating):
+        return depth
+    return depth.astype(np.float32) / np.float32(MILLIMETRES_PER_METRE)
 
 
 def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_symview import keys
-from lerobot_symview.views import View
 from lerobot_symview.workspace import Workspace
+
+if TYPE_CHECKING:
+    from lerobot_symview.views import View
 
 Features = dict[str, dict[str, Any]]
 IMAGE_AXES = ["height", "width", "channels"]
@@ -34,7 +36,12 @@ def camera_features(
     if segmentation:
         labels = {"labels": {"0": "table", "1": "robot", "2 and up": "objects"}}
         features[keys.segmentation(name)] = color_feature(height, width, facts | labels)
-    return features | {
+    return features | calibration_features(name)
+
+
+def calibration_features(name: str) -> Features:
+    """Declare the calibration of one camera."""
+    return {
         keys.intrinsics(name): {
             "dtype": "float32",
             "shape": (9,),
@@ -50,7 +57,7 @@ def camera_features(
 
 def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:
     """Declare the outputs of `view`, with everything needed to compute them again."""
-    facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}  # type: ignore[call-overload]
+    facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
     declare = {"rgb": color_feature, "height": metric_feature}
     return {
         keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()

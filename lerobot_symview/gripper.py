@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import array_api_compat
+import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_symview.workspace import Workspace
 
@@ -38,16 +40,43 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
         finger's border pixels are covered in part, so the picture moves smoothly with the gripper; it turns and
         mirrors exactly with the state, by any angle.
     """
-    shape = shape or GripperShape()
     xp = array_api_compat.array_namespace(state)
-    device = array_api_compat.device(state)
-    centers = ((xp.arange(pixels, dtype=state.dtype, device=device) + 0.5) / pixels - 0.5) * workspace.size
+    centers = ((xp.arange(pixels, dtype=state.dtype, device=array_api_compat.device(state)) + 0.5) / pixels - 0.5) * (
+        workspace.size
+    )
+    return _draw(state, centers, centers, workspace, workspace.size / pixels, shape or GripperShape())
+
+
+def gripper_picture(
+    state: NDArray[np.floating], workspace: Workspace, pixels: int, shape: GripperShape | None = None
+) -> NDArray[np.uint8]:
+    """Draw the gripper of one state (5,) as `gripper_image` does, in grey levels: (pixels, pixels) uint8, 255 = 1.
+
+    Only the square that the gripper can fill is computed.
+    """
+    shape = shape or GripperShape()
+    state = np.asarray(state, dtype=np.float64)
+    resolution = workspace.size / pixels
+    reach = np.hypot(max(state[4], 0.0) * shape.opening / 2 + shape.finger, shape.finger / 2) + resolution
+    spans = []
+    for center in state[:2]:
+        first, last = (center + np.array([-reach, reach])) / resolution + pixels / 2
+        spans.append(slice(*np.clip([np.floor(first), np.ceil(last)], 0, pixels).astype(int)))
+    centers = ((np.arange(pixels) + 0.5) / pixels - 0.5) * workspace.size
+    picture = np.zeros((pixels, pixels), dtype=np.uint8)
+    drawn = _draw(state, centers[spans[0]], centers[spans[1]], workspace, resolution, shape)
+    picture[spans[0], spans[1]] = np.rint(255 * np.clip(drawn, 0.0, 1.0))
+    return picture
+
+
+def _draw(state: Any, rows: Any, columns: Any, workspace: Workspace, resolution: float, shape: GripperShape) -> Any:
+    """Draw at the pixels whose centres lie at `rows` (R,) and `columns` (C,) metres: (..., R, C)."""
+    xp = array_api_compat.array_namespace(state)
     x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
-    forward = centers[:, None] - x
-    sideward = centers[None, :] - y
+    forward = rows[:, None] - x
+    sideward = columns[None, :] - y
     along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # a finger stands on either side: |.| draws both
     across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
-    resolution = workspace.size / pixels
     finger_center = (aperture * shape.opening + shape.finger) / 2
     coverage = _ramp(xp, xp.abs(along - finger_center), shape, resolution) * _ramp(xp, across, shape, resolution)
     return coverage * z / workspace.height_limit

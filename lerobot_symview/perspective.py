@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.camera import Array, CalibrationError, Camera
 from lerobot_symview.workspace import Workspace
+
+FARTHEST = 30_000.0  # pixels
+
+
+class WarpMap(NamedTuple):
+    """What `cv2.remap` reads: see `warp_map`."""
+
+    whole: NDArray[np.int16]
+    fraction: NDArray[np.uint16]
 
 
 def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> Array:
@@ -36,10 +48,31 @@ def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_
     return camera.intrinsics @ cam_from_world[:3] @ world_from_topdown
 
 
-def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: Array, pixels: int) -> NDArray[np.uint8]:
-    """Sample `rgb` (H, W, 3) through a homography into (pixels, pixels, 3), bilinear, black outside the image."""
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(rgb, image_from_topdown, (pixels, pixels), flags=flags), dtype=np.uint8)
+@lru_cache(maxsize=64)
+def warp_map(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> WarpMap:
+    """Return where in the camera's image each pixel of the top-down image lies, for `warp_plane`.
+
+    It is kept for cameras and planes seen before, since finding it takes longer than using it.
+
+    Returns:
+        (pixels, pixels, 2) int16, whole camera pixels (u, v), and (pixels, pixels) uint16, the fractions in steps of
+        1/32 pixel: OpenCV's fixed-point form.
+
+    Raises:
+        CalibrationError: as `image_from_topdown`.
+    """
+    homography = image_from_topdown(camera, workspace, pixels, plane_height)
+    columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
+    u, v, w = homography @ np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
+    # Beyond the image lies black, however far; int16 holds no more.
+    image_xy = np.clip(np.stack([u, v], axis=-1) / w[:, None], -FARTHEST, FARTHEST).astype(np.float32)
+    whole, fraction = cv2.convertMaps(image_xy.reshape(pixels, pixels, 2), None, cv2.CV_16SC2)
+    return WarpMap(whole, fraction)
+
+
+def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: WarpMap) -> NDArray[np.uint8]:
+    """Sample `rgb` (H, W, 3) where `warp_map` says; (pixels, pixels, 3) uint8, bilinear, black outside the image."""
+    return np.asarray(cv2.remap(rgb, *image_from_topdown, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def camera_direction(camera: Camera, workspace: Workspace) -> Array:

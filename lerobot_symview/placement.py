@@ -7,7 +7,7 @@ from dataclasses import astuple, dataclass, field, replace
 import numpy as np
 
 from lerobot_symview.camera import Array, Camera, intrinsics_from_fov, orbit_pose
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.workspace import MINIMUM_VISIBLE, Workspace, check_visible
 
 TOP_DISTANCE = 8.0  # metres: from so far above, perspective shifts a 5 cm block's top by less than a millimetre
 TRIES = 100
@@ -93,7 +93,7 @@ class CameraSpec:
         return max(astuple(self.spread)) > 0
 
     def place(
-        self, workspace: Workspace, rng: np.random.Generator | None = None, minimum_visible: float = 0.6
+        self, workspace: Workspace, rng: np.random.Generator | None = None, minimum_visible: float = MINIMUM_VISIBLE
     ) -> Camera:
         """Return the calibrated camera over `workspace`.
 
@@ -103,20 +103,16 @@ class CameraSpec:
             minimum_visible: share of the working volume that has to be in the image.
 
         Raises:
-            ValueError: if it sees less than `minimum_visible` (none of 100 drawn poses sees as much), or a
-                `CalibrationError` if the matrices are not a camera's.
+            CalibrationError: if it sees less than `minimum_visible` (none of 100 drawn poses sees as much), or the
+                matrices are not a camera's.
         """
         camera = self._camera(workspace, rng)
         for _ in range(TRIES if rng is not None and self.varies else 0):
             if workspace.visible_fraction(camera) >= minimum_visible:
                 break
             camera = self._camera(workspace, rng)
-        visible = workspace.visible_fraction(camera)
-        if visible < minimum_visible:
-            raise ValueError(
-                f"camera {self.name!r} sees {visible:.0%} of the workspace, expected at least {minimum_visible:.0%}: "
-                "raise its distance or fov_deg, turn it towards the workspace, or lower its spread"
-            )
+        remedy = "raise its distance or fov_deg, turn it towards the workspace, or lower its spread"
+        check_visible(self.name, camera, workspace, remedy, minimum_visible)
         return camera
 
     def _camera(self, workspace: Workspace, rng: np.random.Generator | None) -> Camera:

@@ -1,31 +1,89 @@
-"""Results appear whole or not at all: they are written beside their place and moved there."""
+"""Results appear whole or not at all: they are made in `<target>.partial` and moved to `<target>` in the end.
+
+<target>.partial/request.json     what is made; a command that goes on with it must ask for the same
+<target>.partial/...              finished pieces, each complete or absent
+"""
 
 from __future__ import annotations
 
+import errno
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from uuid import uuid4
 
 from lerobot_symview.cli import CommandError
 
+REQUEST = "request.json"
 
-@contextmanager
-def staged(target: Path, flag: str) -> Iterator[Path]:
-    """Yield a folder that does not exist yet, to be filled; it becomes `target` when the block ends without an error.
+
+def partial_folder(target: Path) -> Path:
+    """Return where `target` is made."""
+    return target.with_name(target.name + ".partial")
+
+
+def plain(description: Any) -> dict[str, Any]:
+    """Return a description as JSON holds it, which is how two are compared."""
+    return json.loads(json.dumps(description, default=str))
+
+
+def is_complete(target: Path, made_from: str, description: dict[str, Any], resume: bool, flag: str) -> bool:
+    """Whether an earlier run of the same command made `target`, whose `meta` folder keeps the description `made_from`.
 
     Raises:
-        CommandError: if `target` exists; the message names `flag`, which chooses it.
+        CommandError: if `target` is something else, or `resume` was not asked for; it names `flag`, which chooses it.
     """
-    if target.exists():
-        raise CommandError(f"{target} exists already: choose another {flag} or remove it")
-    partial = target.with_name(target.name + ".partial")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.parent.mkdir(parents=True, exist_ok=True)
+    if not target.exists():
+        return False
+    file = target / "meta" / made_from
+    if resume and file.exists() and json.loads(file.read_text()) == description:
+        shutil.rmtree(partial_folder(target), ignore_errors=True)
+        return True
+    raise CommandError(f"{target} exists already: choose another {flag} or remove it")
+
+
+def open_partial(folder: Path, description: dict[str, Any], resume: bool) -> None:
+    """Prepare the folder in which a result is made, or check that the one that is there makes the same result.
+
+    Raises:
+        CommandError: if there is one and `resume` was not asked for, or it was begun by another command.
+    """
+    file = folder / REQUEST
+    if file.exists():
+        if not resume:
+            raise CommandError(f"{folder} was begun and interrupted: add --resume=true to go on, or remove it")
+        found = json.loads(file.read_text())
+        different = [key for key in description if found.get(key) != description[key]]
+        if different:
+            raise CommandError(
+                f"{folder} was begun with another {', '.join(different)}: repeat the command that began it or remove it"
+            )
+        return
+    if folder.exists():  # what a clean-up that was interrupted left behind
+        shutil.rmtree(folder)
+    folder.mkdir(parents=True)
+    part = part_of(file)
+    part.write_text(json.dumps(description))
+    part.replace(file)
+
+
+def part_of(path: Path) -> Path:
+    """Return a name beside `path`, used by nobody else, for what is not complete yet."""
+    return path.with_name(f"{path.name}.{uuid4().hex}.part")
+
+
+@contextmanager
+def disk_errors(folder: Path) -> Iterator[None]:
+    """Say what to do when nothing more can be written to `folder`."""
     try:
-        yield partial
-        partial.rename(target)
-    finally:
-        if partial.exists():
-            shutil.rmtree(partial)
+        yield
+    except OSError as error:
+        free = shutil.disk_usage(folder).free / 2**20
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        raise CommandError(
+            f"cannot write to {folder} ({free:.0f} MiB free): {error}. {'Make room and repeat' if full else 'Repeat'} "
+            "the command with --resume=true: what is finished is kept"
+        ) from None

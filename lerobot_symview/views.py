@@ -1,24 +1,27 @@
 """Views: images from above, made from one camera frame by a pure function with a frozen configuration.
 
 `VIEWS` is the one registry that the offline command and the online processor step read. A new view is a frozen
-dataclass with `outputs`, `needs_depth` and `render`, decorated with `@register_view(name)`.
+dataclass with the members of `View`, decorated with `@register_view(name)`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.camera import Camera, unproject
-from lerobot_symview.gripper import gripper_image
+from lerobot_symview.camera import Camera, depth_in_metres
+from lerobot_symview.gripper import gripper_picture
+from lerobot_symview.infill import INFILLS, fill_local, nearest_known
 from lerobot_symview.names import lookup
-from lerobot_symview.perspective import image_from_topdown, warp_plane
-from lerobot_symview.reproject import EMPTY, INFILLS, fill_local, fill_nearest, zbuffer
+from lerobot_symview.perspective import warp_map, warp_plane
+from lerobot_symview.upsampling import enlarge_depth
 from lerobot_symview.workspace import Workspace
+from lerobot_symview.zbuffer import EMPTY, gather, zbuffer_from_depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,30 +30,45 @@ class Frame:
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) float, metres along the optical axis; 0, negative or non-finite = invalid; None without a sensor.
+        depth: (H, W) along the optical axis, float metres or integer millimetres; 0, negative or non-finite = invalid;
+            None without a sensor.
         camera: calibration.
         workspace: what the view shows.
-        gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture.
+        gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture; None
+            where it is not known.
     """
 
     rgb: NDArray[np.uint8]
-    depth: NDArray[np.floating] | None
+    depth: NDArray | None
     camera: Camera
     workspace: Workspace
-    gripper: NDArray[np.floating]
+    gripper: NDArray[np.floating] | None = None
 
 
 class View(Protocol):
-    """A way of looking at a frame from above."""
+    """A way of looking at a frame from above: a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def size(self) -> int:
         """Rows and columns of every output."""
         ...
 
-    # Suffix of the feature -> "rgb" (uint8, (size, size, 3)) or "height" (float32, (size, size), metres).
-    outputs: ClassVar[dict[str, str]]
-    needs_depth: ClassVar[bool]
+    @property
+    def outputs(self) -> dict[str, Literal["rgb", "height"]]:
+        """Suffix of the feature -> "rgb" (uint8, (size, size, 3)) or "height" (float32, (size, size), metres)."""
+        ...
+
+    @property
+    def needs_depth(self) -> bool:
+        """Whether the frame must have depth."""
+        ...
+
+    @property
+    def needs_gripper(self) -> bool:
+        """Whether the frame must say where the gripper is."""
+        ...
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the image of every output."""
@@ -77,89 +95,160 @@ def make_view(name: str, **options: Any) -> View:
     return lookup("view", name, VIEWS)(**options)
 
 
+def choose_views(names: list[str], size: int | None, options: dict[str, View]) -> dict[str, View]:
+    """Return the views `names`, each as `options` state it or with its defaults, all of `size` pixels if that is given.
+
+    Raises:
+        ValueError: if there is no name, or one that is unknown.
+    """
+    if not names:
+        raise ValueError("--views is empty, name at least one view")
+    views = {name: options[name] if name in options else make_view(name) for name in names}
+    return views if size is None else {name: replace(view, size=size) for name, view in views.items()}
+
+
 @register_view("reproj")
 @dataclass(frozen=True)
 class ReprojectedView:
-    """RGBD reprojection: the point cloud of the frame drawn orthographically from above (paper section 4.1).
-
-    Args:
-        size: rows and columns.
-        infill: what to put where no point fell, `nearest` (the paper's best), `local` or `none`.
-        clip: `gripper` drops points higher than the gripper, which removes the arm; `none` keeps all.
-        clip_margin: metres below the gripper at which the cut lies, since the fingers reach below its position.
-        clip_floor: metres under which nothing is cut, so that what the gripper touches stays visible.
-    """
+    """RGBD reprojection: the point cloud of the frame drawn orthographically from above (paper section 4.1)."""
 
     size: int = 152
+    """Rows and columns."""
     infill: Literal["nearest", "local", "none"] = "nearest"
-    clip: Literal["gripper", "none"] = "gripper"
+    """What to put where no point fell: the nearest one (the paper's best), the mean of those nearby, or black."""
+    clip: Literal["gripper", "none"] | float = "gripper"
+    """Drop points higher than the gripper, which removes the arm; `none` keeps all; a number cuts at as many metres."""
     clip_margin: float = 0.01
+    """Metres below the gripper at which the cut lies, since the fingers reach below its position."""
     clip_floor: float = 0.06
+    """Metres under which the gripper cuts nothing, so that what it touches stays visible."""
+    source_scale: int = 1
+    """Interpolate the depth image to so many times its rows and columns first, so that no gaps are left between points
+    of one surface."""
+    height: bool = True
+    """Add `reproj_height`: metres above the table, one channel, which LeRobot's own policies do not take."""
+    mask: bool = False
+    """Add `reproj_seen`: white where a point was seen, black where it is inferred from others."""
 
-    outputs: ClassVar[dict[str, str]] = {"reproj": "rgb", "reproj_height": "height"}
-    needs_depth: ClassVar[bool] = True
+    @property
+    def outputs(self) -> dict[str, Literal["rgb", "height"]]:
+        """Colour, height above the table, and the mask."""
+        outputs: dict[str, Literal["rgb", "height"]] = {"reproj": "rgb"}
+        if self.height:
+            outputs["reproj_height"] = "height"
+        if self.mask:
+            outputs["reproj_seen"] = "rgb"
+        return outputs
+
+    @property
+    def needs_depth(self) -> bool:
+        """Always."""
+        return True
+
+    @property
+    def needs_gripper(self) -> bool:
+        """Only to clip there."""
+        return self.clip == "gripper"
 
     def __post_init__(self) -> None:
         _check_size(self.size)
-        _check_choice("infill", self.infill, INFILLS)
-        _check_choice("clip", self.clip, ("gripper", "none"))
+        if self.infill not in INFILLS:
+            raise ValueError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
+        if isinstance(self.clip, str) and self.clip not in ("gripper", "none"):
+            raise ValueError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
+        if not 1 <= self.source_scale <= 8:
+            raise ValueError(f"source_scale must lie in 1 to 8, got {self.source_scale}")
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return colour and height above the table; where nothing is known, black and 0."""
+        """Return the outputs; where nothing is known, black and 0."""
         if frame.depth is None:
             raise ValueError("the view 'reproj' needs depth; for a camera without it use 'persp'")
-        measured = np.isfinite(frame.depth) & (frame.depth > 0)
-        points = unproject(np.where(measured, frame.depth, 0), frame.camera).reshape(-1, 3)
-        valid = measured.ravel()
-        if self.clip == "gripper":
-            ceiling = max(float(frame.gripper[2]) - self.clip_margin, self.clip_floor)
-            valid &= points[:, 2] <= ceiling
-        source = zbuffer(points, valid, frame.workspace, self.size)
-        if self.infill == "nearest":
-            source = fill_nearest(source)
-        known = source != EMPTY
-        rgb = np.where(known[..., None], frame.rgb.reshape(-1, 3)[source], 0).astype(np.uint8)
-        height = np.where(known, points[source, 2], 0.0).astype(np.float32)
+        depth, camera, rgb = depth_in_metres(frame.depth), frame.camera, frame.rgb
+        if self.source_scale > 1:
+            depth, camera = enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
+            rgb = rgb.repeat(self.source_scale, axis=0).repeat(self.source_scale, axis=1)
+        buffer = zbuffer_from_depth([depth], [camera], frame.workspace, self.size, self._ceiling(frame))
+        seen = buffer.source != EMPTY
+        shown = nearest_known(seen) if self.infill == "nearest" else _every_cell(self.size)
+        colors, height = gather(shown, buffer, rgb.reshape(-1, 3))
         if self.infill == "local":
-            rgb, height = fill_local(rgb, known), fill_local(height, known)
-        return {"reproj": rgb, "reproj_height": height}
+            colors, height = fill_local(colors, seen), fill_local(height, seen)
+        images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
+        if self.mask:
+            images["reproj_seen"] = np.repeat(np.where(seen, np.uint8(255), np.uint8(0))[..., None], 3, axis=-1)
+        return {output: images[output] for output in self.outputs}
+
+    def _ceiling(self, frame: Frame) -> float:
+        if self.clip == "none":
+            return np.inf
+        if self.clip == "gripper":
+            return max(_gripper_height(frame, "clip") - self.clip_margin, self.clip_floor)
+        return float(self.clip)
 
 
 @register_view("persp")
 @dataclass(frozen=True)
 class PerspectiveView:
-    """RGB perspective: a plane parallel to the table warped to lie flat, and the gripper drawn (paper section 4.2).
-
-    Args:
-        size: rows and columns.
-        plane_height: metres above the table of the plane that is mapped exactly.
-    """
+    """RGB perspective: a plane parallel to the table warped to lie flat, and the gripper drawn (paper section 4.2)."""
 
     size: int = 152
-    plane_height: float = 0.0
+    """Rows and columns."""
+    plane_height: Literal["gripper"] | float = 0.0
+    """Metres above the table of the plane that is mapped exactly; `gripper` moves it with the gripper."""
+    gripper: bool = True
+    """Add `persp_gripper`: the fingers drawn where they are, the brighter the higher."""
 
-    outputs: ClassVar[dict[str, str]] = {"persp": "rgb", "persp_gripper": "rgb"}
-    needs_depth: ClassVar[bool] = False
+    @property
+    def outputs(self) -> dict[str, Literal["rgb", "height"]]:
+        """The warped image and the gripper image."""
+        outputs: dict[str, Literal["rgb", "height"]] = {"persp": "rgb"}
+        if self.gripper:
+            outputs["persp_gripper"] = "rgb"
+        return outputs
+
+    @property
+    def needs_depth(self) -> bool:
+        """Never."""
+        return False
+
+    @property
+    def needs_gripper(self) -> bool:
+        """To draw it and to follow it."""
+        return self.gripper or self.plane_height == "gripper"
 
     def __post_init__(self) -> None:
         _check_size(self.size)
+        if isinstance(self.plane_height, str) and self.plane_height != "gripper":
+            raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the warped image and the gripper image (grey, brightness = height)."""
-        homography = image_from_topdown(frame.camera, frame.workspace, self.size, self.plane_height)
-        gripper = gripper_image(np.asarray(frame.gripper, dtype=np.float64), frame.workspace, self.size)
-        grey = np.rint(255 * np.clip(gripper, 0, 1)).astype(np.uint8)
-        return {
-            "persp": warp_plane(frame.rgb, homography, self.size),
-            "persp_gripper": np.repeat(grey[..., None], 3, axis=-1),
-        }
+        height = _gripper_height(frame, "plane_height") if self.plane_height == "gripper" else float(self.plane_height)
+        images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, height))}
+        if self.gripper:
+            if frame.gripper is None:
+                raise ValueError("the gripper image needs the gripper's state; without it, gripper=false")
+            grey = gripper_picture(frame.gripper, frame.workspace, self.size)
+            images["persp_gripper"] = np.repeat(grey[..., None], 3, axis=-1)
+        return images
+
+
+@lru_cache(maxsize=64)
+def _enlarged(camera: Camera, factor: int) -> Camera:
+    return camera.enlarged(factor)
+
+
+@lru_cache(maxsize=8)
+def _every_cell(pixels: int) -> NDArray[np.int32]:
+    return np.arange(pixels**2, dtype=np.int32).reshape(pixels, pixels)
+
+
+def _gripper_height(frame: Frame, option: str) -> float:
+    if frame.gripper is None:
+        raise ValueError(f"{option}=gripper needs the gripper's state; without it, state a height in metres")
+    return float(frame.gripper[2])
 
 
 def _check_size(size: int) -> None:
     if size < 8:
         raise ValueError(f"a view's size must be at least 8 pixels, got {size}")
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")

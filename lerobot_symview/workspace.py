@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_symview.camera import Array, Camera, project
+from lerobot_symview.camera import Array, CalibrationError, Camera, project
+
+MINIMUM_VISIBLE = 0.6  # share of the working volume
 
 
 @dataclass(frozen=True)
@@ -57,3 +59,18 @@ class Workspace:
         pixels, depth = project(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), camera)
         inside = (pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])
         return float((inside.all(axis=-1) & (depth > 0)).mean())
+
+
+def check_visible(
+    name: str, camera: Camera, workspace: Workspace, remedy: str, minimum: float = MINIMUM_VISIBLE
+) -> None:
+    """Refuse a camera that sees too little.
+
+    Raises:
+        CalibrationError: if less than `minimum` of the working volume is in its image; says how much, and the `remedy`.
+    """
+    visible = workspace.visible_fraction(camera)
+    if visible < minimum:
+        raise CalibrationError(
+            f"camera {name!r} sees {visible:.0%} of the workspace, expected at least {minimum:.0%}: {remedy}"
+        )

@@ -1,22 +1,33 @@
 """Shared fixtures: a tiny recorded dataset and the same with views, made once by the library itself."""
 
 import os
+import resource
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-# Hugging Face's libraries read these when they are imported, which happens below.
+# Hugging Face's libraries and numba read these when they are imported, which happens below.
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["HF_HOME"] = tempfile.mkdtemp(prefix="symview-hf-")
 os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
+# Compiled kernels check every index, and are kept apart from those that do not.
+os.environ["NUMBA_BOUNDSCHECK"] = "1"
+os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="symview-numba-")
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.workspace import Workspace
 from symview_sim.generate import GenerateConfig, RecordedDataset, generate
+
+# The same examples every time, so that a failure can be repeated; no time limit, since the first one compiles.
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
+settings.load_profile("repeatable")
 
 VIEW_SIZE = 76
 EPISODES = 2
@@ -70,3 +81,14 @@ def make_camera(elevation: float = 45.0, azimuth: float = 0.0, size: int = 152, 
         size,
         size,
     )
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """Let every write beyond `size` bytes of a file fail, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

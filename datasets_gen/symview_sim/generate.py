@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 from dataclasses import asdict, dataclass, field
@@ -15,12 +14,14 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.camera import project
-from lerobot_symview.cli import CommandError, DatasetTarget, run_command
+from lerobot_symview.cli import DatasetTarget, run_command
+from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, camera_features
 from lerobot_symview.names import lookup
+from lerobot_symview.staging import is_complete, open_partial, partial_folder
 from symview_sim.env import SymviewEnv
-from symview_sim.executors import EXECUTORS
 from symview_sim.recording import (
+    MADE_FROM,
     MAX_VIDEO_DEPTH,
     Recording,
     join_shards,
@@ -97,13 +98,12 @@ def generate(config: GenerateConfig) -> Path:
     """Write the dataset that `config` describes and return its folder."""
     target = config.dataset.folder()
     recording = _plan(config, target)
-    if target.exists():
-        if config.resume and _description(target / "meta" / "symview_recording.json") == recording.description():
-            shutil.rmtree(recording.folder, ignore_errors=True)
-            logger.info("%s is complete already", target)
-            return target
-        raise CommandError(f"{target} exists already: choose another --dataset.root or remove it")
-    _open(recording, config.resume)
+    if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):
+        logger.info("%s is complete already", target)
+        return target
+    open_partial(recording.folder, recording.description(), config.resume)
+    for pieces in ("episodes", "shards"):
+        (recording.folder / pieces).mkdir(exist_ok=True)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
     with EXECUTORS[config.executor](config.num_workers) as executor:
@@ -129,7 +129,7 @@ def _plan(config: GenerateConfig, target: Path) -> Recording:
     if config.video:
         _check_video_depth(env, config.env.oracle)
     recording = Recording(
-        folder=target.with_name(target.name + ".partial"),
+        folder=partial_folder(target),
         repo_id=config.dataset.repo_id,
         env=config.env,
         instruction=env.task_description,
@@ -142,35 +142,6 @@ def _plan(config: GenerateConfig, target: Path) -> Recording:
     )
     env.close()
     return recording
-
-
-def _open(recording: Recording, resume: bool) -> None:
-    """Prepare the recording's folder, or check that the one that is there is this recording's."""
-    file = recording.folder / "recording.json"
-    if file.exists():
-        if not resume:
-            raise CommandError(
-                f"{recording.folder} holds an interrupted recording: add --resume=true to go on, or remove it"
-            )
-        found, wanted = _description(file), recording.description()
-        different = [key for key in wanted if found.get(key) != wanted[key]]
-        if different:
-            raise CommandError(
-                f"{recording.folder} holds another recording, which differs in {', '.join(different)}: "
-                "repeat the command that began it, or remove it"
-            )
-        return
-    if recording.folder.exists():  # what a clean-up that was interrupted left behind
-        shutil.rmtree(recording.folder)
-    for part in ("episodes", "shards"):
-        (recording.folder / part).mkdir(parents=True)
-    part_file = file.with_suffix(".part")
-    part_file.write_text(json.dumps(recording.description()))
-    part_file.replace(file)
-
-
-def _description(file: Path) -> dict[str, object]:
-    return json.loads(file.read_text()) if file.exists() else {}
 
 
 def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:

@@ -1,6 +1,6 @@
 """A recording in progress: a folder of finished episodes, the shards made from them, and the dataset made from those.
 
-    <target>.partial/recording.json     what is recorded; a resumed run must ask for the same
+    <target>.partial/request.json       what is recorded; a resumed run must ask for the same
     <target>.partial/episodes/*.npz     an episode each, complete or absent
     <target>.partial/shards/*           LeRobot datasets of neighbouring episodes, complete or absent
     <target>.partial/dataset            the shards aggregated, moved to <target> in the end
@@ -11,7 +11,6 @@ killed at any moment loses the episodes it was simulating and no others.
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import logging
@@ -22,17 +21,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
-from uuid import uuid4
 
 import numpy as np
 
-from lerobot_symview.cli import CommandError
 from lerobot_symview.features import Features
+from lerobot_symview.staging import disk_errors, part_of, plain
 from symview_sim.demonstration import Episode, demonstrate
 from symview_sim.settings import EnvSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
 ATTEMPTS_KEY = "attempts"
+MADE_FROM = "symview_recording.json"  # in the finished dataset's `meta`
 # With its own block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images in spite of `lossless`.
 LOSSLESS = "lossless=1:ctu=16:bframes=0"
 MAX_VIDEO_DEPTH = 1.6  # metres: with 12 bits, steps of 0.39 mm and errors of at most 0.2 mm
@@ -71,17 +70,17 @@ class Recording:
         """What determines the data, as JSON holds it."""
         content = asdict(self)
         del content["folder"]
-        return json.loads(json.dumps(content))
+        return plain(content)
 
 
 def record_episode(recording: Recording, episode: int) -> int:
     """Simulate an episode and keep it; return how many attempts it took."""
     frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
     file = recording.episode_file(episode)
-    part = _part_of(file)
+    part = part_of(file)
     content: dict[str, Any] = {**frames, ATTEMPTS_KEY: attempts}
     try:
-        with _disk_errors(recording.folder):
+        with disk_errors(recording.folder):
             with part.open("wb") as stream:
                 np.savez(stream, **content)
             part.replace(file)
@@ -104,8 +103,8 @@ def write_shard(recording: Recording, shard: range) -> Path:
     folder = recording.shard_folder(shard)
     if folder.exists():
         return folder
-    part = _part_of(folder)
-    with _disk_errors(recording.folder), _failed_images() as failures, _unhashed():
+    part = part_of(folder)
+    with disk_errors(recording.folder), _failed_images() as failures, _unhashed():
         dataset = _create_dataset(recording, part)
         for episode in shard:
             for frame in _frames(recording.episode_file(episode)):
@@ -128,7 +127,7 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
     if joined.exists():
         shutil.rmtree(joined)
     attempts = recorded_attempts(recording)
-    with _disk_errors(recording.folder):
+    with disk_errors(recording.folder):
         if len(shards) == 1:
             shards[0].rename(joined)
         else:
@@ -142,13 +141,8 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
                     concatenate_videos=False,
                 )
         _complete_metadata(joined, len(attempts) / sum(attempts.values()))
-        (joined / "meta" / "symview_recording.json").write_text(json.dumps(recording.description(), indent=4))
+        (joined / "meta" / MADE_FROM).write_text(json.dumps(recording.description(), indent=4))
     return joined
-
-
-def _part_of(path: Path) -> Path:
-    """Return a name beside `path`, used by nobody else, for what is not complete yet."""
-    return path.with_name(f"{path.name}.{uuid4().hex}.part")
 
 
 def _create_dataset(recording: Recording, root: Path) -> Any:
@@ -218,17 +212,3 @@ def _unhashed() -> Iterator[None]:
     """Spare LeRobot a sixth of the time: it has every episode's table hashed, to name a cache that it never uses."""
     with patch("datasets.arrow_dataset.generate_fingerprint", return_value="0" * 16):
         yield
-
-
-@contextmanager
-def _disk_errors(folder: Path) -> Iterator[None]:
-    """Say what to do when nothing more can be written."""
-    try:
-        yield
-    except OSError as error:
-        free = shutil.disk_usage(folder).free / 2**20
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        raise CommandError(
-            f"cannot write to {folder} ({free:.0f} MiB free): {error}. {'Make room and repeat' if full else 'Repeat'} "
-            "the command with --resume=true: what is finished is kept"
-        ) from None

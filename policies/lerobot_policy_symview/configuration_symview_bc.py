@@ -13,7 +13,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot_policy_symview.symmetry import ThetaRepresentation, check_declaration
 from lerobot_symview import keys
 from lerobot_symview.names import lookup
-from lerobot_symview.views import VIEWS, make_view
+from lerobot_symview.views import VIEWS, View, make_view
 from lerobot_symview.workspace import Workspace
 
 CAMERA_IMAGES = ("side", "top")  # views that are a camera's own image: nothing is computed
@@ -102,15 +102,14 @@ class SymviewBcConfig(PreTrainedConfig):
         if not self.is_computed:
             return keys.depth(self.view)
         height = f"{self.view}_height"
-        return keys.view(self.camera, height) if height in VIEWS[self.view].outputs else None  # type: ignore[attr-defined]
+        return keys.view(self.camera, height) if height in self._made_view().outputs else None
 
     @property
     def raw_keys(self) -> list[str]:
         """Features a camera must deliver for the policy to run."""
         if not self.is_computed:
             return [self.color_key] + ([keys.depth(self.view)] if self.modality == "rgbd" else [])
-        needs_depth = VIEWS[self.view].needs_depth  # type: ignore[attr-defined]
-        return [keys.rgb(self.camera)] + ([keys.depth(self.camera)] if needs_depth else [])
+        return [keys.rgb(self.camera)] + ([keys.depth(self.camera)] if self._made_view().needs_depth else [])
 
     @property
     def channels(self) -> int:
@@ -138,7 +137,7 @@ class SymviewBcConfig(PreTrainedConfig):
                 f"--policy.view={self.view} needs {self.raw_keys} or {self.color_key!r}; "
                 f"the dataset has {sorted(key for key in features if 'images' in key)}"
             )
-        size = features[self.color_key]["shape"][0] if self.color_key in features else self._made_size()
+        size = features[self.color_key]["shape"][0] if self.color_key in features else self._made_view().size
         if size < self.crop_size:
             raise ValueError(
                 f"--policy.crop_size={self.crop_size} is larger than the {size} px view {self.color_key!r}: "
@@ -153,8 +152,8 @@ class SymviewBcConfig(PreTrainedConfig):
         }
         self.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, tuple(features[keys.ACTION]["shape"]))}
 
-    def _made_size(self) -> int:
-        return make_view(self.view, **self.view_options).size if self.is_computed else 0
+    def _made_view(self) -> View:
+        return make_view(self.view, **self.view_options)
 
     def validate_features(self) -> None:
         """Check that the inputs and outputs LeRobot settled on are there."""

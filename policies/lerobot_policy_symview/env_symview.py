@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium
@@ -15,7 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
 from lerobot_symview.placement import CameraSpec
-from lerobot_symview.views import make_view
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
 
 # What a simulator process imports; loaded once by the fork server instead of six seconds in each process.
 PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
@@ -44,8 +44,12 @@ class SymviewEnvConfig(EnvConfig):
     """Observe which pixel shows table, robot or which object."""
     views: list[str] = field(default_factory=list)
     """Views of the first camera to add to each observation, for policies that do not compute their own."""
-    view_size: int = 152
-    """Rows and columns of those views."""
+    view_size: int | None = None
+    """Rows and columns of those views, in place of each one's own."""
+    reproj: ReprojectedView = field(default_factory=ReprojectedView)
+    """Options of the view reproj."""
+    persp: PerspectiveView = field(default_factory=PerspectiveView)
+    """Options of the view persp."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
     max_steps: int = 50
@@ -63,8 +67,7 @@ class SymviewEnvConfig(EnvConfig):
                 shapes[keys.depth(name)] = (*size, 1)
             if self.segmentation:
                 shapes[keys.segmentation(name)] = (*size, 3)
-        for name in self.views:
-            view = make_view(name, size=self.view_size)
+        for name, view in self._chosen_views().items():
             if view.needs_depth and not self.depth:
                 raise ValueError(f"the view {name!r} needs depth: leave --env.depth=true or use 'persp'")
             for output, kind in view.outputs.items():
@@ -75,6 +78,10 @@ class SymviewEnvConfig(EnvConfig):
             **{key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in shapes.items()},
         }
         self.features_map = {key: key for key in self.features}
+
+    def _chosen_views(self) -> dict[str, View]:
+        options: dict[str, View] = {"reproj": self.reproj, "persp": self.persp}
+        return choose_views(self.views, self.view_size, options) if self.views else {}
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -113,6 +120,6 @@ class SymviewEnvConfig(EnvConfig):
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Return the pipeline that adds `views`, and the identity for actions."""
-        options = {view: {"size": self.view_size} for view in self.views}
+        options = {name: asdict(view) for name, view in self._chosen_views().items()}
         step = ViewsProcessorStep(views=options, camera=self.camera.name)
         return PolicyProcessorPipeline(steps=[step] if options else []), PolicyProcessorPipeline(steps=[])

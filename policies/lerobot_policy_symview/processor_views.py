@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_symview import keys
-from lerobot_symview.camera import Camera
+from lerobot_symview.calibration import parse_calibration, parse_workspace
+from lerobot_symview.camera import CalibrationError, Camera, stored_camera
 from lerobot_symview.views import Frame, make_view
-from lerobot_symview.workspace import Workspace
 
 METRES_AT_MOST = 10.0
 
@@ -35,31 +35,42 @@ def metres(depth: Tensor) -> Tensor:
 class ViewsProcessorStep(ObservationProcessorStep):
     """Adds views of one camera to an observation; does nothing for a view that is already there.
 
+    For an observation without its camera's calibration, such as a real robot's, `calibration` states it.
+
     Args:
         views: name -> options of every view wanted, as for `lerobot_symview.views.make_view`.
         camera: the camera they are made from.
         workspace: constructor arguments of `Workspace`.
+        calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
+        gripper: which entries of `observation.state` are the gripper's x, y, z, yaw and aperture.
     """
 
     views: dict[str, dict[str, Any]] = field(default_factory=dict)
     camera: str = "side"
     workspace: dict[str, Any] = field(default_factory=dict)
+    calibration: dict[str, Any] = field(default_factory=dict)
+    gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
 
     def __post_init__(self) -> None:
         self._views = {name: make_view(name, **options) for name, options in self.views.items()}
-        arguments = dict(self.workspace)
-        if "center" in arguments:
-            arguments["center"] = tuple(arguments["center"])
-        self._workspace = Workspace(**arguments)
+        self._workspace = parse_workspace(self.workspace)
+        self._stated = parse_calibration(self.calibration).camera(self.camera) if self.calibration else None
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with each missing view, as float32 (B, C, size, size) like any other image."""
-        for view in self._views.values():
-            wanted = [keys.view(self.camera, output) for output in view.outputs]
-            if all(key in observation for key in wanted):
-                continue
-            images = [view.render(frame) for frame in self._frames(observation, view.needs_depth)]
-            device = observation[keys.STATE].device
+        missing = {
+            name: view
+            for name, view in self._views.items()
+            if not all(keys.view(self.camera, output) in observation for output in view.outputs)
+        }
+        if not missing:
+            return observation
+        needs_depth = any(view.needs_depth for view in missing.values())
+        needs_gripper = any(view.needs_gripper for view in missing.values())
+        frames = self._frames(observation, list(missing), needs_depth, needs_gripper)
+        device = observation[keys.rgb(self.camera)].device
+        for view in missing.values():
+            images = [view.render(frame) for frame in frames]
             for output, kind in view.outputs.items():
                 stacked = torch.from_numpy(np.stack([image[output] for image in images])).to(device)
                 observation[keys.view(self.camera, output)] = (
@@ -69,7 +80,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
     def get_config(self) -> dict[str, Any]:
         """Return the constructor's arguments, which a checkpoint stores as JSON."""
-        return {"views": self.views, "camera": self.camera, "workspace": self.workspace}
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -77,27 +88,34 @@ class ViewsProcessorStep(ObservationProcessorStep):
         """Leave the declared features alone: the policy names what it needs."""
         return features
 
-    def _frames(self, observation: RobotObservation, needs_depth: bool) -> list[Frame]:
-        needed = [keys.rgb(self.camera), keys.intrinsics(self.camera), keys.world_from_cam(self.camera), keys.STATE]
-        if needs_depth:
-            needed.append(keys.depth(self.camera))
+    def _frames(
+        self, observation: RobotObservation, views: list[str], needs_depth: bool, needs_gripper: bool
+    ) -> list[Frame]:
+        needed = [keys.rgb(self.camera)]
+        needed += [keys.depth(self.camera)] if needs_depth else []
+        needed += [keys.STATE] if needs_gripper else []
+        if self._stated is None:
+            needed += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
         missing = [key for key in needed if key not in observation]
         if missing:
-            raise KeyError(f"the views {list(self.views)} need {missing}, the observation has {sorted(observation)}")
+            raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
         arrays = {key: observation[key].detach().cpu() for key in needed}
-        rgb = (arrays[keys.rgb(self.camera)] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).numpy()
+        rgb = (arrays[keys.rgb(self.camera)] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
         depth = metres(arrays[keys.depth(self.camera)])[:, 0].numpy() if needs_depth else [None] * len(rgb)
+        gripper = arrays[keys.STATE][:, self.gripper].numpy() if needs_gripper else [None] * len(rgb)
         return [
-            Frame(
-                rgb=rgb[i],
-                depth=depth[i],
-                camera=Camera(
-                    arrays[keys.intrinsics(self.camera)][i].numpy().reshape(3, 3),
-                    arrays[keys.world_from_cam(self.camera)][i].numpy().reshape(4, 4),
-                    *rgb.shape[1:3],
-                ),
-                workspace=self._workspace,
-                gripper=arrays[keys.STATE][i].numpy(),
-            )
+            Frame(rgb[i], depth[i], self._camera(arrays, i, *rgb.shape[1:3]), self._workspace, gripper[i])
             for i in range(len(rgb))
         ]
+
+    def _camera(self, arrays: dict[str, Tensor], index: int, height: int, width: int) -> Camera:
+        if self._stated is None:
+            intrinsics = arrays[keys.intrinsics(self.camera)][index].numpy()
+            world_from_cam = arrays[keys.world_from_cam(self.camera)][index].numpy()
+            return stored_camera(intrinsics, world_from_cam, height, width)
+        if (height, width) != (self._stated.height, self._stated.width):
+            raise CalibrationError(
+                f"camera {self.camera!r} is calibrated for {self._stated.height} x {self._stated.width} pixels, "
+                f"the observation has {height} x {width}"
+            )
+        return self._stated

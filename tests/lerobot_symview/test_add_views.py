@@ -1,17 +1,29 @@
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets import LeRobotDataset
+import yaml
+from lerobot.datasets import LeRobotDataset, modify_features
 
-from lerobot_symview import keys
+from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.camera import Camera
+from lerobot_symview.camera import CalibrationError, Camera, stored_camera
 from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_symview.placement import CameraSpec, CameraSpread
+from lerobot_symview.source_dataset import SourceDataset, vectors
 from lerobot_symview.views import VIEWS, Frame, make_view
 from lerobot_symview.workspace import Workspace
-from tests.conftest import VIEW_SIZE
+from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+from tests.conftest import VIEW_SIZE, largest_file
 
 
 def parquet_columns(folder):
@@ -107,6 +119,230 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, option
     with pytest.raises(error, match=message):
         add_views(config)
     assert list(tmp_path.iterdir()) == []
+
+
+def views_config(source, target, **options):
+    defaults = {"new_repo_id": "test/derived", "new_root": target, "views": ["reproj", "persp"], "size": VIEW_SIZE}
+    return AddViewsConfig(DatasetTarget("test/recorded", source), **(defaults | options))
+
+
+def contents(folder):
+    return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.fixture
+def small_parts(monkeypatch):
+    """A part for every episode."""
+    monkeypatch.setattr(derivation, "PART_FRAMES", 1)
+
+
+@pytest.fixture
+def reference(recorded, small_parts, tmp_path):
+    """What an undisturbed process writes."""
+    return contents(add_views(views_config(recorded, tmp_path / "reference")))
+
+
+def test_the_number_of_processes_does_not_change_a_byte(recorded, reference, tmp_path):
+    assert contents(add_views(views_config(recorded, tmp_path / "derived", num_workers=2))) == reference
+
+
+def test_parts_are_cut_at_episodes_within_files(recorded, small_parts):
+    source = SourceDataset(recorded)
+    assert derivation.cut_parts(source) == [range(0, 1), range(1, 2)]
+
+
+def test_an_interrupted_run_goes_on(recorded, reference, tmp_path, monkeypatch):
+    target, written = tmp_path / "derived", []
+
+    def fail_at_the_second(one, part):
+        if written:
+            raise KeyboardInterrupt
+        written.append(part)
+        return derivation.write_part(one, part)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot_symview.add_views.write_part", fail_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            add_views(views_config(recorded, target))
+    assert not target.exists()
+    with pytest.raises(CommandError, match="begun and interrupted: add --resume=true"):
+        add_views(views_config(recorded, target))
+    with pytest.raises(CommandError, match="begun with another views: repeat the command"):
+        add_views(views_config(recorded, target, size=VIEW_SIZE + 2, resume=True))
+    kept = next((tmp_path / "derived.partial").rglob("*.parquet"))
+    written_at = kept.stat().st_mtime_ns
+    add_views(views_config(recorded, target, resume=True))
+    assert contents(target) == reference
+    assert (target / kept.relative_to(tmp_path / "derived.partial" / "dataset")).stat().st_mtime_ns == written_at
+    before = contents(target)
+    add_views(views_config(recorded, target, resume=True))  # complete already
+    assert contents(target) == before
+    assert not (tmp_path / "derived.partial").exists()
+
+
+FORKING = f"""
+import os, pathlib, sys
+import cv2, datasets
+from lerobot_symview import add_views, derivation
+from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.views import *
+from tests.lerobot_symview.test_views import make_frame
+cv2.setNumThreads(0)  # threads do not survive a fork
+for name in VIEWS:  # compiled once
+    make_view(name).render(make_frame())
+source, target = map(pathlib.Path, sys.argv[1:])
+for _ in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        derivation.PART_FRAMES = 1
+        add_views.add_views(add_views.AddViewsConfig(
+            DatasetTarget('test/recorded', source), new_repo_id='test/derived', new_root=target,
+            views=['reproj', 'persp'], size={VIEW_SIZE}, resume=True))
+        os._exit(0)
+    print(child, flush=True)
+    print(os.waitpid(child, 0)[1], flush=True)
+"""
+
+
+def test_a_killed_process_loses_nothing_finished(recorded, reference, tmp_path):
+    """SIGKILL at random moments, a little later each time, until one run gets to the end."""
+    target = tmp_path / "derived"
+    rng, kills = np.random.default_rng(0), 0
+    command = [sys.executable, "-c", FORKING, str(recorded), str(target)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as forking:
+        for attempt in range(40):
+            forking.stdin.write(b"go\n")
+            forking.stdin.flush()
+            child = int(forking.stdout.readline())
+            time.sleep(0.05 * attempt + rng.uniform(0, 0.1))
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+            status = int(forking.stdout.readline())
+            if status == 0:
+                break
+            assert status == signal.SIGKILL
+            kills += 1
+            assert not target.exists() or contents(target) == reference
+    assert contents(target) == reference
+    assert kills > 0
+
+
+def test_a_full_disk_is_reported_and_the_run_goes_on_later(recorded, reference, tmp_path):
+    target = tmp_path / "derived"
+    with largest_file(30_000), pytest.raises(CommandError, match=r"cannot write to .*MiB free.*--resume=true"):
+        add_views(views_config(recorded, target))
+    assert not target.exists()
+    add_views(views_config(recorded, target, resume=True))
+    assert contents(target) == reference
+
+
+def images_of(folder, key):
+    dataset = LeRobotDataset("test/images", root=folder, depth_output_unit="m", video_backend="pyav")
+    return np.stack([dataset[i][key].numpy() for i in range(len(dataset))])
+
+
+def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
+    """Of lossless videos the views are those of the images; depth, stored in steps, moves few points."""
+    env = RecordedEnv(camera=CameraSpec(height=64, width=64), oracle=False)
+    folders = {}
+    for video in (False, True):
+        target = RecordedDataset("test/recorded", tmp_path / f"source-{video}")
+        source = generate(GenerateConfig(target, env=env, num_episodes=2, video=video))
+        folders[video] = add_views(views_config(source, tmp_path / f"views-{video}"))
+    copied = {path: data for path, data in contents(folders[True]).items() if path.suffix == ".mp4"}
+    assert copied
+    assert copied == {path: data for path, data in contents(tmp_path / "source-True").items() if path.suffix == ".mp4"}
+    key = keys.view("side", "persp")
+    np.testing.assert_array_equal(images_of(folders[True], key), images_of(folders[False], key))
+    key = keys.view("side", "reproj_height")
+    difference = np.abs(images_of(folders[True], key) - images_of(folders[False], key))
+    assert (difference > 3e-4).mean() < 0.02
+    only = add_views(views_config(tmp_path / "source-True", tmp_path / "only", keep=[]))
+    assert not (only / "videos").exists()
+    np.testing.assert_array_equal(images_of(only, key), images_of(folders[True], key))
+
+
+def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
+    """A dataset without calibration gets the same views from a file, and the calibration with them."""
+    source = LeRobotDataset("test/recorded", root=recorded)
+    calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
+    matrices = {key: source[0][key].tolist() for key in calibrations}
+    modify_features(source, remove_features=calibrations, output_dir=tmp_path / "bare", repo_id="test/bare")
+    with pytest.raises(ValueError, match=r"lacks observation\.camera.*calibrated cameras: none, see --calibration"):
+        add_views(views_config(tmp_path / "bare", tmp_path / "never"))
+    side = {"height": 152, "width": 152, "intrinsics": np.reshape(matrices[keys.intrinsics("side")], (3, 3)).tolist()}
+    side["world_from_cam"] = np.reshape(matrices[keys.world_from_cam("side")], (4, 4)).tolist()
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump({"units": "m", "cameras": {"side": side}}))
+    result = add_views(views_config(tmp_path / "bare", tmp_path / "derived", calibration=file))
+    for name in VIEWS:
+        for output in make_view(name).outputs:
+            key = keys.view("side", output)
+            np.testing.assert_array_equal(images_of(result, key), images_of(with_views, key))
+    dataset = LeRobotDataset("test/derived", root=result)
+    assert dataset[0][keys.world_from_cam("side")].tolist() == matrices[keys.world_from_cam("side")]
+    assert dataset.meta.stats[keys.intrinsics("side")]["std"].tolist() == [0.0] * 9
+    with pytest.raises(ValueError, match=r"has observation\.camera\.side\.intrinsics.* already"):
+        add_views(views_config(recorded, tmp_path / "never", calibration=file))
+    file.write_text(yaml.safe_dump({"units": "m", "cameras": {"side": side | {"height": 76, "width": 76}}}))
+    with pytest.raises(CalibrationError, match=r"principal point|152 x 152"):
+        add_views(views_config(tmp_path / "bare", tmp_path / "never", calibration=file))
+    assert not list(tmp_path.glob("never*"))
+
+
+def test_a_camera_that_moves_is_followed(tmp_path):
+    camera = CameraSpec(height=64, width=64, spread=CameraSpread(azimuth_deg=180.0, elevation_deg=20.0))
+    env = RecordedEnv(camera=camera, oracle=False)
+    target = RecordedDataset("test/recorded", tmp_path / "moving")
+    source = LeRobotDataset("test/moving", root=generate(GenerateConfig(target, env=env, num_episodes=2)))
+    result = LeRobotDataset("test/v", root=add_views(views_config(tmp_path / "moving", tmp_path / "derived")))
+    key = keys.world_from_cam("side")
+    assert (source[0][key] != source[len(source) - 1][key]).any()
+    for index in (0, len(source) - 1):
+        item = source[index]
+        camera = stored_camera(item[keys.intrinsics("side")].numpy(), item[key].numpy(), 64, 64)
+        rgb = (item[keys.rgb("side")] * 255).round().byte().permute(1, 2, 0).numpy()
+        frame = Frame(rgb, None, camera, Workspace(), item[keys.STATE].numpy())
+        expected = make_view("persp", size=VIEW_SIZE).render(frame)["persp"]
+        stored = (result[index][keys.view("side", "persp")] * 255).round().byte().permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(stored, expected)
+
+
+def test_without_the_grippers_pose_the_flags_that_do_without_are_named(recorded, tmp_path):
+    source = tmp_path / "joints"
+    shutil.copytree(recorded, source)
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["features"][keys.STATE]["names"] = [f"joint_{i}" for i in range(5)]
+    (source / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match=r"x, y, z, yaw, aperture among the names.*--reproj\.clip.*--persp\.gripper"):
+        add_views(views_config(source, tmp_path / "derived"))
+    options = {"reproj": make_view("reproj", clip=0.2), "persp": make_view("persp", gripper=False)}
+    add_views(views_config(source, tmp_path / "derived", **options))
+
+
+def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
+    source = tmp_path / "broken"
+    shutil.copytree(recorded, source)
+    file = next(source.rglob("data/**/*.parquet"))
+    table = pq.read_table(file)
+    poses = vectors(table, keys.world_from_cam("side")).copy()
+    poses[4, 0] += 0.3
+    column = pa.FixedSizeListArray.from_arrays(pa.array(poses.ravel()), 16)
+    index = table.column_names.index(keys.world_from_cam("side"))
+    pq.write_table(table.set_column(index, table.schema.field(index), column), file)
+    with pytest.raises(CalibrationError, match=r"episode 0, frame 4, camera 'side': .*not orthonormal"):
+        add_views(views_config(source, tmp_path / "derived"))
+
+
+def test_tables_are_read_however_their_row_groups_are_cut(recorded, reference, tmp_path):
+    source = tmp_path / "recut"
+    shutil.copytree(recorded, source)
+    file = next(source.rglob("data/**/*.parquet"))
+    pq.write_table(pq.read_table(file), file, row_group_size=5)
+    result = add_views(views_config(source, tmp_path / "derived"))
+    for path, data in reference.items():
+        if path.parts[0] == "data":
+            assert (result / path).read_bytes() == data
 
 
 @pytest.mark.parametrize("views", [[], ["reprojection"]])

@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from lerobot_symview.gripper import GripperShape, gripper_image
+from lerobot_symview.gripper import GripperShape, gripper_image, gripper_picture
+from lerobot_symview.workspace import Workspace
 
 STATE = np.array([0.06, -0.03, 0.1, 0.4, 0.7])
 
@@ -50,3 +53,15 @@ def test_torch_and_numpy_agree_and_batches_are_independent(workspace):
 
 def test_a_gripper_outside_the_workspace_is_not_drawn(workspace):
     assert gripper_image(STATE + [1, 0, 0, 0, 0], workspace, 76).max() == 0
+
+
+PLACES = st.floats(-0.3, 0.3)
+
+
+@given(x=PLACES, y=PLACES, z=st.floats(0, 0.4), yaw=st.floats(-4, 4), aperture=st.floats(0, 1))
+def test_the_picture_is_the_image_in_grey_levels(x, y, z, yaw, aperture):
+    state = np.array([x, y, z, yaw, aperture])
+    image = gripper_image(state, Workspace(), 76)
+    np.testing.assert_array_equal(
+        gripper_picture(state, Workspace(), 76), np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+    )

@@ -1,10 +1,14 @@
 import cv2
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
-from lerobot_symview.camera import CalibrationError, Camera, project
-from lerobot_symview.perspective import camera_direction, image_from_topdown, warp_plane
+from lerobot_symview.camera import CalibrationError, Camera, project, stored_camera
+from lerobot_symview.perspective import camera_direction, image_from_topdown, warp_map, warp_plane
+from lerobot_symview.workspace import Workspace
 from tests.conftest import make_camera
+from tests.lerobot_symview.cameras import cameras, moved, moved_picture, world_motion
 
 POSES = [(45, 0), (15, 60), (75, -100), (90, 0)]
 
@@ -34,7 +38,62 @@ def test_a_camera_at_the_oracles_place_is_left_unchanged(workspace):
     fov = 2 * np.rad2deg(np.arctan(workspace.size / 2 / 0.81))
     camera = make_camera(90.0, size=size, fov=fov)
     rgb = np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)
-    np.testing.assert_array_equal(warp_plane(rgb, image_from_topdown(camera, workspace, size), size), rgb)
+    np.testing.assert_array_equal(warp_plane(rgb, warp_map(camera, workspace, size)), rgb)
+
+
+@given(camera=cameras((60, 80)), height=st.floats(0.0, 0.05))
+def test_corners_of_the_view_are_corners_of_the_workspace_to_a_thousandth_of_a_pixel(camera, height):
+    workspace, pixels = Workspace(), 76
+    corners = workspace.corners(height)
+    assume((project(corners, camera)[1] > 0).all())
+    edges = np.array([[-0.5, -0.5], [75.5, -0.5], [75.5, 75.5], [-0.5, 75.5]])  # TL, TR, BR, BL as (column, row)
+    mapped = image_from_topdown(camera, workspace, pixels, height) @ np.column_stack([edges, np.ones(4)]).T
+    np.testing.assert_allclose((mapped[:2] / mapped[2]).T, project(corners, camera)[0], atol=1e-3)
+
+
+@given(camera=cameras((60, 80)))
+def test_warping_samples_like_the_homography(camera):
+    """Each pixel is the bilinear mean of the image where the homography says, within OpenCV's steps of 1/32 pixel."""
+    workspace, pixels = Workspace(), 30
+    assume((project(workspace.corners(), camera)[1] > 0).all())
+    ramp = np.add.outer(np.arange(60) * 2.0, np.arange(80) * 1.5)  # linear, so that it can be evaluated anywhere
+    image = np.repeat(np.rint(ramp)[..., None], 3, axis=-1).astype(np.uint8)
+    columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
+    u, v, w = image_from_topdown(camera, workspace, pixels) @ np.stack([columns.ravel(), rows.ravel(), np.ones(900)])
+    u, v = (u / w).reshape(pixels, pixels), (v / w).reshape(pixels, pixels)
+    inside = (u > 0) & (u < 79) & (v > 0) & (v < 59)
+    warped = warp_plane(image, warp_map(camera, workspace, pixels))
+    np.testing.assert_allclose(warped[..., 0][inside], (2 * v + 1.5 * u)[inside], atol=1.2)
+    outside = (u < -1) | (u > 80) | (v < -1) | (v > 60)
+    assert not warped[outside].any()
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+@given(camera=cameras((60, 80)), height=st.floats(0.0, 0.05))
+def test_moving_world_and_camera_moves_the_sampled_points(quarter_turns, mirror, camera, height):
+    workspace, pixels = Workspace(), 20
+    assume((project(workspace.corners(height), camera)[1] > 0).all())
+    labels = np.arange(pixels**2).reshape(pixels, pixels)
+
+    def sampled(one):
+        columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
+        flat = np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
+        u, v, w = image_from_topdown(one, workspace, pixels, height) @ flat
+        return np.column_stack([u / w, v / w])
+
+    there, _ = moved(camera, np.zeros((60, 80)), quarter_turns, mirror)
+    expected = sampled(camera)[moved_picture(labels, quarter_turns, mirror).ravel()]
+    if mirror:
+        expected[:, 0] = camera.width - 1 - expected[:, 0]
+    np.testing.assert_allclose(sampled(there), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_maps_are_kept_for_cameras_that_stay(workspace):
+    arrays = make_camera().intrinsics.astype(np.float32), make_camera().world_from_cam.astype(np.float32)
+    first, second = (stored_camera(*(array.copy() for array in arrays), 152, 152) for _ in range(2))
+    assert warp_map(first, workspace, 76) is warp_map(second, workspace, 76)
+    assert warp_map(first, workspace, 76) is not warp_map(first, workspace, 76, 0.01)
 
 
 def test_a_camera_that_cannot_see_the_plane_is_refused(workspace):
@@ -54,3 +113,12 @@ def test_camera_direction_points_from_the_centre_to_the_camera(workspace, azimut
 
 def test_camera_direction_is_zero_straight_above(workspace):
     np.testing.assert_allclose(camera_direction(make_camera(90), workspace), 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+@given(camera=cameras())
+def test_camera_direction_turns_and_mirrors_with_the_world(quarter_turns, mirror, camera):
+    there, _ = moved(camera, np.zeros((40, 56)), quarter_turns, mirror)
+    expected = world_motion(quarter_turns, mirror)[:2, :2] @ camera_direction(camera, Workspace())
+    np.testing.assert_allclose(camera_direction(there, Workspace()), expected, atol=1e-9)

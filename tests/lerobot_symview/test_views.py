@@ -1,10 +1,15 @@
+from dataclasses import fields, replace
+from itertools import product
+
 import numpy as np
 import pytest
 
 from lerobot_symview.camera import Camera
+from lerobot_symview.infill import INFILLS
 from lerobot_symview.views import VIEWS, Frame, make_view, register_view
 from lerobot_symview.workspace import Workspace
 from tests.conftest import make_camera
+from tests.lerobot_symview.test_upsampling import plane_depth
 
 SIZE = 32
 CENTRE = (0.45, 0.0)
@@ -111,10 +116,100 @@ def test_an_unknown_view_is_answered_with_the_nearest_known_one():
         make_view("reprojj")
 
 
-@pytest.mark.parametrize("options", [{"infill": "magic"}, {"clip": "high"}, {"size": 0}])
-def test_impossible_options_are_refused(options):
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("reproj", {"infill": "magic"}),
+        ("reproj", {"clip": "high"}),
+        ("reproj", {"size": 0}),
+        ("reproj", {"source_scale": 0}),
+        ("persp", {"plane_height": "table"}),
+    ],
+)
+def test_impossible_options_are_refused(name, options):
     with pytest.raises(ValueError, match=next(iter(options))):
-        make_view("reproj", **options)
+        make_view(name, **options)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_every_combination_of_outputs_is_what_is_declared(name):
+    switches = [field.name for field in fields(VIEWS[name]) if isinstance(field.default, bool)]
+    for values in product([False, True], repeat=len(switches)):
+        view = make_view(name, size=SIZE, **dict(zip(switches, values, strict=True)))
+        assert list(view.render(make_frame())) == list(view.outputs)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_that_needs_no_gripper_does_without(name):
+    options = {"reproj": {"clip": "none"}, "persp": {"gripper": False}}[name]
+    view = make_view(name, size=SIZE, **options)
+    assert not view.needs_gripper
+    view.render(replace(make_frame(), gripper=None))
+    assert make_view(name).needs_gripper
+    with pytest.raises(ValueError, match="gripper"):
+        make_view(name, size=SIZE).render(replace(make_frame(), gripper=None))
+
+
+def test_a_fixed_height_cuts_wherever_the_gripper_is():
+    for gripper_height in (0.02, 0.2):
+        frame = make_frame(gripper=(0.0, 0.0, gripper_height, 0.0, 1.0))
+        heights = make_view("reproj", size=SIZE, clip=0.03).render(frame)["reproj_height"]
+        assert 0.02 < heights.max() <= 0.03 + 1e-6
+
+
+def test_the_plane_follows_the_gripper_if_asked():
+    frame = make_frame(gripper=(0.0, 0.0, 0.07, 0.0, 1.0))
+    following = make_view("persp", size=SIZE, plane_height="gripper").render(frame)["persp"]
+    np.testing.assert_array_equal(
+        following, make_view("persp", size=SIZE, plane_height=float(frame.gripper[2])).render(frame)["persp"]
+    )
+    assert (following != make_view("persp", size=SIZE).render(frame)["persp"]).any()
+
+
+def table_frame(camera, dtype=np.float32):
+    """The bare table, each pixel of another colour."""
+    rgb = np.random.default_rng(0).integers(1, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+    return Frame(rgb, plane_depth(camera).astype(dtype), camera, Workspace(), np.array([0.0, 0.0, 0.3, 0.0, 1.0]))
+
+
+def test_a_larger_source_leaves_no_gaps_in_a_surface():
+    frame = table_frame(make_camera(45.0))
+    shares = [
+        (make_view("reproj", source_scale=scale, mask=True).render(frame)["reproj_seen"] > 0).mean()
+        for scale in (1, 2, 4)
+    ]
+    assert shares[0] < 0.5  # at 45 degrees an image of the same size has fewer points than the view has pixels
+    assert shares[0] < shares[1] < shares[2]
+    assert shares[2] == 1.0
+
+
+@pytest.mark.parametrize("scale", [1, 3])
+def test_the_mask_tells_seen_from_inferred(scale):
+    frame = make_frame()
+    options = {"size": SIZE, "source_scale": scale, "mask": True}
+    bare = make_view("reproj", infill="none", **options).render(frame)
+    filled = make_view("reproj", **options).render(frame)
+    seen = filled["reproj_seen"][..., 0] > 0
+    np.testing.assert_array_equal(filled["reproj_seen"], bare["reproj_seen"])
+    np.testing.assert_array_equal(filled["reproj"][seen], bare["reproj"][seen])
+    assert not bare["reproj"][~seen].any()
+    assert set(np.unique(filled["reproj_seen"])) <= {0, 255}
+
+
+def test_millimetres_are_taken_as_such():
+    frame = table_frame(make_camera(60.0))
+    millimetres = replace(frame, depth=np.rint(frame.depth * 1000).astype(np.uint16))
+    in_metres = replace(frame, depth=np.rint(frame.depth * 1000).astype(np.float32) / np.float32(1000))
+    view = make_view("reproj", size=SIZE)
+    for output, image in view.render(millimetres).items():
+        np.testing.assert_array_equal(image, view.render(in_metres)[output])
+
+
+@pytest.mark.parametrize("infill", INFILLS)
+def test_a_frame_without_any_point_gives_black(infill):
+    frame = replace(make_frame(), depth=np.zeros((96, 96), np.float32))
+    images = make_view("reproj", size=SIZE, infill=infill, mask=True).render(frame)
+    assert not any(image.any() for image in images.values())
 
 
 def test_a_name_is_registered_once():

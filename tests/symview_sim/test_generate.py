@@ -1,12 +1,10 @@
 import filecmp
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
-from tests.conftest import EPISODES
+from tests.conftest import EPISODES, largest_file
 
 SMALL = RecordedEnv(camera=CameraSpec(height=32, width=32), oracle=False)
 COMMAND = Path(sys.executable).parent / "symview-generate"
@@ -42,17 +40,6 @@ def assert_same_data(folder, other):
             assert pq.read_table(folder / file).equals(pq.read_table(other / file)), file
         else:
             assert filecmp.cmp(folder / file, other / file, shallow=False), file
-
-
-@contextmanager
-def largest_file(size):
-    """Let every write beyond `size` bytes of a file fail, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.fixture(scope="module")
@@ -191,15 +178,15 @@ def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tm
     _begun(tmp_path)
     with pytest.raises(CommandError, match="add --resume=true"):
         generate(config(tmp_path / "data"))
-    with pytest.raises(CommandError, match="another recording, which differs in features, seed"):
+    with pytest.raises(CommandError, match="begun with another features, seed"):
         generate(config(tmp_path / "data", seed=1, resume=True))
-    with pytest.raises(CommandError, match="differs in env, features"):
+    with pytest.raises(CommandError, match="begun with another env, features"):
         generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
 
 
 def test_what_an_interrupted_clean_up_left_is_not_adopted(small_shards, tmp_path):
     plan = _begun(tmp_path)
-    (plan.folder / "recording.json").unlink()
+    (plan.folder / "request.json").unlink()
     folder = generate(config(tmp_path / "data", num_episodes=1, seed=1))
     starts = LeRobotDataset("test/small", root=folder)[0][keys.ACTION].numpy()
     np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0)[0][keys.ACTION][0])
@@ -244,7 +231,7 @@ def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monk
 
 
 def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
-    from symview_sim.executors import ProcessExecutor
+    from lerobot_symview.executors import ProcessExecutor
 
     with ProcessExecutor(1) as executor, pytest.raises(CommandError, match="worker process died"):
         list(executor.run(os._exit, [1]))

@@ -1,0 +1,281 @@
+"""A dataset derived from another: the same episodes with views added, made in parts by any number of processes.
+
+    <target>.partial/request.json       what is made; a resumed run must ask for the same
+    <target>.partial/dataset/           the result; its tables' files are the parts, each complete or absent
+    <target>.partial/statistics/        of the new images, a part each
+
+A part is a range of neighbouring episodes. Which there are follows from the source alone, so that the result is the
+same whoever writes which part when.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lerobot_symview import keys
+from lerobot_symview.calibration import Calibration
+from lerobot_symview.features import Features
+from lerobot_symview.image_codec import encode_metres, encode_rgb
+from lerobot_symview.image_statistics import ImageStatistics, constant_summary
+from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.staging import disk_errors, part_of
+from lerobot_symview.views import View
+from lerobot_symview.workspace import Workspace
+
+PART_FRAMES = 200  # at least, where a file of the source has as many
+MADE_FROM = "symview_views.json"  # in the result's `meta`
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """What is derived from what; small enough to send to every worker."""
+
+    source: Path
+    """Folder of the dataset that is read."""
+    folder: Path
+    """`<target>.partial`."""
+    camera: str
+    """Whose images the views are made from."""
+    views: dict[str, View]
+    """What is added."""
+    workspace: Workspace
+    """What the views show."""
+    calibration: Calibration | None
+    """The camera's, where the dataset has none; it is added too."""
+    dropped: list[str]
+    """Features of the source that are left out."""
+    added: Features
+    """Features that are new."""
+    schema: pa.Schema = field(repr=False)
+    """Of the result's tables."""
+
+    @property
+    def dataset(self) -> Path:
+        """Where the result grows."""
+        return self.folder / "dataset"
+
+    def reader(self, source: SourceDataset) -> FrameReader:
+        """Return what puts the frames of `source` together."""
+        return FrameReader(
+            source,
+            self.camera,
+            self.workspace,
+            depth=any(view.needs_depth for view in self.views.values()),
+            gripper=any(view.needs_gripper for view in self.views.values()),
+            calibration=self.calibration,
+        )
+
+    def image_kinds(self) -> dict[str, str]:
+        """Return `rgb` or `height` for every new image feature."""
+        return {
+            keys.view(self.camera, output): kind
+            for view in self.views.values()
+            for output, kind in view.outputs.items()
+        }
+
+    def table_file(self, source: SourceDataset, part: int) -> Path:
+        """Where a part's table is in the result."""
+        return self.dataset / source.data_path(*self.place(source, part))
+
+    def place(self, source: SourceDataset, part: int) -> tuple[int, int]:
+        """Chunk and file of a part's table."""
+        return divmod(part, source.info["chunks_size"])
+
+    def statistics_file(self, part: int) -> Path:
+        """Where the statistics of a part's new images are."""
+        return self.folder / "statistics" / f"{part:06d}.npz"
+
+
+def cut_parts(source: SourceDataset) -> list[range]:
+    """Return the episodes of every part: neighbours in one file, of 200 frames together or a few more."""
+    parts: list[range] = []
+    frames = 0
+    for episode, row in enumerate(source.episodes):
+        if parts and frames < PART_FRAMES and source.data_file(episode) == source.data_file(parts[-1].start):
+            parts[-1] = range(parts[-1].start, episode + 1)
+            frames += row["length"]
+        else:
+            parts.append(range(episode, episode + 1))
+            frames = row["length"]
+    return parts
+
+
+def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -> pa.Schema:
+    """Return the schema of the result's tables, with the declaration that Hugging Face's `datasets` reads."""
+    from datasets import Features as TableFeatures
+    from datasets import Image, List, Value
+
+    features = dict(TableFeatures.from_arrow_schema(pq.read_schema(source.data_file(0))))
+    for key in dropped:
+        features.pop(key, None)  # a video has no column
+    for key, feature in added.items():
+        is_image = feature["dtype"] == "image"
+        features[key] = Image() if is_image else List(Value(feature["dtype"]), length=feature["shape"][0])
+    return TableFeatures(features).arrow_schema
+
+
+def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
+    """Write the table and the statistics of a part's episodes, unless they are there; return how many frames."""
+    index, episodes = part
+    source = SourceDataset(derivation.source)
+    count = sum(source.episodes[episode]["length"] for episode in episodes)
+    table_file, statistics_file = derivation.table_file(source, index), derivation.statistics_file(index)
+    if table_file.exists():
+        return count
+    kinds = derivation.image_kinds()
+    merged = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    summaries = {}
+    reader = derivation.reader(source)
+    kept = [name for name in derivation.schema.names if name not in derivation.added]
+    columns = list(dict.fromkeys([*kept, *reader.columns()]))
+    tables = EpisodeTables(source, source.data_file(episodes.start), columns)
+    # Written outside the result, so that what a killed process leaves behind is not in it.
+    table_part, statistics_part = (part_of(derivation.folder / file.name) for file in (table_file, statistics_file))
+    with disk_errors(derivation.folder):
+        try:
+            with pq.ParquetWriter(table_part, derivation.schema) as writer:
+                for episode in episodes:
+                    table = tables.read(episode)
+                    new, statistics = _render(derivation, reader, episode, table)
+                    arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
+                    # a row group per episode, as LeRobot writes them
+                    writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
+                    summaries[episode] = {key: one.summary() for key, one in statistics.items()}
+                    for key, one in statistics.items():
+                        merged[key].merge(one)
+            with statistics_part.open("wb") as stream:
+                np.savez_compressed(stream, **_packed(merged), summaries=np.array(json.dumps(summaries)))
+            for done, file in ((statistics_part, statistics_file), (table_part, table_file)):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                done.replace(file)
+        finally:
+            for leftover in (table_part, statistics_part):
+                leftover.unlink(missing_ok=True)
+    return count
+
+
+def _render(
+    derivation: Derivation, reader: FrameReader, episode: int, table: pa.Table
+) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
+    """Return the new columns of an episode, and the statistics of its new images."""
+    kinds = derivation.image_kinds()
+    statistics = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
+    for frame in reader.frames(episode, table):
+        for view in derivation.views.values():
+            for output, image in view.render(frame).items():
+                key = keys.view(derivation.camera, output)
+                statistics[key].add(image)
+                encoded[key].append(encode_rgb(image) if kinds[key] == "rgb" else encode_metres(image))
+    columns: dict[str, pa.Array] = {}
+    for key, images in encoded.items():
+        extension = "png" if kinds[key] == "rgb" else "tiff"
+        names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
+        columns[key] = pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
+    for key, values in _added_vectors(derivation).items():
+        flat = pa.array(np.tile(values, len(table)))
+        columns[key] = pa.FixedSizeListArray.from_arrays(flat, len(values))
+    return columns, statistics
+
+
+def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
+    """Return the calibration that the result gains, by feature."""
+    if derivation.calibration is None:
+        return {}
+    camera = derivation.calibration.camera(derivation.camera)
+    matrices = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
+    return {key(derivation.camera): matrix.astype(np.float32).ravel() for key, matrix in matrices.items()}
+
+
+def _packed(merged: dict[str, ImageStatistics]) -> dict[str, Any]:
+    packed: dict[str, Any] = {}
+    for key, one in merged.items():
+        packed |= {f"{key}/images": one.images, f"{key}/counts": one.counts, f"{key}/sums": one.sums}
+    return packed
+
+
+def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> Path:
+    """Complete the result, whose tables are all there, by videos and metadata, and return its folder."""
+    source = SourceDataset(derivation.source)
+    with disk_errors(derivation.folder):
+        for key, feature in source.features.items():
+            if feature["dtype"] == "video" and key not in derivation.dropped:
+                shutil.copytree(source.folder / "videos" / key, derivation.dataset / "videos" / key, dirs_exist_ok=True)
+        meta = derivation.dataset / "meta"
+        if meta.exists():
+            shutil.rmtree(meta)
+        shutil.copytree(source.folder / "meta", meta)
+        totals, summaries = _collect_statistics(derivation, source, parts)
+        for file in sorted((meta / "episodes").rglob("*.parquet")):
+            _rewrite_episodes(file, derivation, source, parts, summaries)
+        info = dict(source.info)
+        kept = {key: feature for key, feature in source.features.items() if key not in derivation.dropped}
+        info["features"] = kept | derivation.added
+        if not any(feature["dtype"] == "video" for feature in kept.values()):
+            info["video_path"] = None
+        (meta / "info.json").write_text(json.dumps(info, indent=4))
+        stats = json.loads((meta / "stats.json").read_text())
+        stats = {key: value for key, value in stats.items() if key not in derivation.dropped} | totals
+        (meta / "stats.json").write_text(json.dumps(stats, indent=4, sort_keys=True))
+        (meta / MADE_FROM).write_text(json.dumps(description, indent=4))
+    return derivation.dataset
+
+
+def _collect_statistics(
+    derivation: Derivation, source: SourceDataset, parts: list[range]
+) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
+    """Return the statistics of every new feature over the dataset, and over each episode."""
+    kinds = derivation.image_kinds()
+    totals = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    summaries: dict[int, dict[str, Any]] = {}
+    for part in range(len(parts)):
+        with np.load(derivation.statistics_file(part)) as content:
+            for key, total in totals.items():
+                counted = (content[f"{key}/{name}"] for name in ("images", "counts", "sums"))
+                images, counts, sums = counted
+                total.merge(ImageStatistics(total.kind, int(images), counts, sums))
+            summaries |= {int(episode): one for episode, one in json.loads(str(content["summaries"])).items()}
+    collected = {key: total.summary() for key, total in totals.items()}
+    for key, values in _added_vectors(derivation).items():
+        collected[key] = constant_summary(values, source.info["total_frames"])
+        for episode, one in summaries.items():
+            one[key] = constant_summary(values, source.episodes[episode]["length"])
+    return collected, summaries
+
+
+def _rewrite_episodes(
+    file: Path, derivation: Derivation, source: SourceDataset, parts: list[range], summaries: dict[int, dict[str, Any]]
+) -> None:
+    """Say where each episode's table is now, and add and drop statistics."""
+    table = pq.read_table(file).replace_schema_metadata(None)
+    dropped = tuple(
+        f"{place}/{key}/" for place in ("stats", "videos") for key in (*derivation.dropped, *derivation.added)
+    )
+    table = table.drop_columns([name for name in table.column_names if name.startswith(dropped)])
+    episodes = table["episode_index"].to_pylist()
+    part_of_episode = {episode: part for part, range_ in enumerate(parts) for episode in range_}
+    places = np.array([derivation.place(source, part_of_episode[episode]) for episode in episodes])
+    for column, values in (("data/chunk_index", places[:, 0]), ("data/file_index", places[:, 1])):
+        table = table.set_column(table.column_names.index(column), column, pa.array(values))
+    for key, summary in summaries[episodes[0]].items():
+        for name in summary:
+            values = pa.array([summaries[episode][key][name] for episode in episodes])
+            table = table.append_column(f"stats/{key}/{name}", values)
+    pq.write_table(table, file)
+
+
+def source_fingerprint(source: SourceDataset) -> str:
+    """Return what changes when the source's metadata or the size of any of its files does."""
+    digest = hashlib.sha256((source.folder / "meta" / "info.json").read_bytes())
+    for file in sorted(path for path in source.folder.rglob("*") if path.is_file()):
+        digest.update(f"{file.relative_to(source.folder)} {file.stat().st_size}\n".encode())
+    return digest.hexdigest()

@@ -1,0 +1,107 @@
+"""Statistics over all pixels of many images, from histograms: nothing is sampled, and parts can be added up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: what lies outside counts, for quantiles, as lying at the border
+
+
+@dataclass(eq=False)
+class ImageStatistics:
+    """What is known of the images seen so far.
+
+    Colour's quantiles are exact; those of metres are multiples of 0.1 mm. Everything else is exact up to rounding.
+
+    Args:
+        kind: `rgb` for (H, W, 3) uint8, counted in levels of 1/255 as LeRobot does, or `height` for (H, W) float32.
+        images: how many.
+        counts: (C, bins) int64, pixels per level.
+        sums: (C, 4) float64: minimum, maximum, sum and sum of squares.
+    """
+
+    kind: Literal["rgb", "height"]
+    images: int
+    counts: NDArray[np.int64]
+    sums: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, kind: Literal["rgb", "height"]) -> Self:
+        """Return the statistics of no image."""
+        channels, bins = (3, 256) if kind == "rgb" else (1, round((HIGHEST - LOWEST) / STEP) + 1)
+        sums = np.tile([np.inf, -np.inf, 0.0, 0.0], (channels, 1))
+        return cls(kind, 0, np.zeros((channels, bins), dtype=np.int64), sums)
+
+    def add(self, image: NDArray) -> None:
+        """Count one image."""
+        self.images += 1
+        if self.kind == "rgb":
+            _count_levels(image, self.counts)  # from which the rest follows
+        else:
+            _count_metres(image, self.counts[0], self.sums[0])
+
+    def merge(self, other: Self) -> None:
+        """Count what `other` has counted."""
+        self.images += other.images
+        self.counts += other.counts
+        self.sums[:, 0] = np.minimum(self.sums[:, 0], other.sums[:, 0])
+        self.sums[:, 1] = np.maximum(self.sums[:, 1], other.sums[:, 1])
+        self.sums[:, 2:] += other.sums[:, 2:]
+
+    def summary(self) -> dict[str, Any]:
+        """Return LeRobot's statistics of an image feature: lists of shape (C, 1, 1), and the number of images."""
+        total = self.counts.sum(axis=1)
+        if self.kind == "rgb":
+            levels: NDArray = np.arange(256) / 255
+            minimum, maximum = (levels[[f(np.flatnonzero(c)) for c in self.counts]] for f in (np.min, np.max))
+            mean = self.counts @ levels / total
+            variance = self.counts @ levels**2 / total - mean**2
+        else:
+            levels = LOWEST + STEP * np.arange(self.counts.shape[1])
+            minimum, maximum = self.sums[:, 0], self.sums[:, 1]
+            mean = self.sums[:, 2] / total
+            variance = self.sums[:, 3] / total - mean**2
+        values: dict[str, NDArray] = {
+            "min": minimum,
+            "max": maximum,
+            "mean": mean,
+            "std": np.sqrt(np.maximum(variance, 0.0)),
+        }
+        cumulative = self.counts.cumsum(axis=1)
+        for name, share in QUANTILES.items():
+            values[name] = levels[[np.searchsorted(c, share * c[-1]) for c in cumulative]]
+        return {name: value.reshape(-1, 1, 1).tolist() for name, value in values.items()} | {"count": [self.images]}
+
+
+def constant_summary(values: NDArray[np.floating], count: int) -> dict[str, Any]:
+    """Return LeRobot's statistics of a feature that is `values` (N,) in each of `count` frames."""
+    same = {name: values.tolist() for name in ("min", "max", "mean", *QUANTILES)}
+    return same | {"std": np.zeros_like(values).tolist(), "count": [count]}
+
+
+@njit(cache=True, nogil=True)
+def _count_levels(image, counts):  # type: ignore[no-untyped-def]
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            for channel in range(image.shape[2]):
+                counts[channel, image[i, j, channel]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _count_metres(image, counts, sums):  # type: ignore[no-untyped-def]
+    minimum, maximum, total, squares = sums
+    for i in range(image.shape[0]):
+        for j in range(image.shape[1]):
+            value = np.float64(image[i, j])
+            minimum, maximum = min(minimum, value), max(maximum, value)
+            total += value
+            squares += value * value
+            level = int((min(max(value, LOWEST), HIGHEST) - LOWEST) / STEP + 0.5)
+            counts[level] += 1
+    sums[0], sums[1], sums[2], sums[3] = minimum, maximum, total, squares

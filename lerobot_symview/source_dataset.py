@@ -1,0 +1,246 @@
+"""A LeRobot dataset on disk, read episode by episode, and the frames that views are made from.
+
+Tables are read as they are: LeRobot itself, which takes seconds to import, is needed for videos alone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice, repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from lerobot_symview import keys
+from lerobot_symview.calibration import Calibration
+from lerobot_symview.camera import CalibrationError, Camera, stored_camera
+from lerobot_symview.cli import CommandError
+from lerobot_symview.features import Features
+from lerobot_symview.image_codec import decode_depth, decode_rgb
+from lerobot_symview.views import Frame
+from lerobot_symview.workspace import Workspace
+
+VIDEO_FRAMES = 64  # decoded at a time
+VIDEO_TOLERANCE = 1e-4  # seconds, LeRobot's own
+
+
+class SourceDataset:
+    """A LeRobot dataset in a folder.
+
+    Args:
+        folder: where it is.
+
+    Raises:
+        CommandError: if there is none, or one of another format.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        file = folder / "meta" / "info.json"
+        if not file.is_file():
+            raise CommandError(f"no dataset at {folder}: check --dataset.repo_id and --dataset.root")
+        self.info: dict[str, Any] = json.loads(file.read_text())
+        version = self.info.get("codebase_version")
+        if version != "v3.0":
+            raise CommandError(f"the dataset at {folder} has format {version}, expected v3.0: convert it with LeRobot")
+
+    @property
+    def features(self) -> Features:
+        """What it holds, as `meta/info.json` says."""
+        return self.info["features"]
+
+    @cached_property
+    def episodes(self) -> list[dict[str, Any]]:
+        """What `meta/episodes` says of every episode, in order, without its statistics."""
+        rows = []
+        for file in sorted((self.folder / "meta" / "episodes").rglob("*.parquet")):
+            names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
+            rows += pq.read_table(file, columns=names).to_pylist()
+        return sorted(rows, key=lambda row: row["episode_index"])
+
+    def data_file(self, episode: int) -> Path:
+        """Where an episode's table is."""
+        row = self.episodes[episode]
+        return self.folder / self.data_path(row["data/chunk_index"], row["data/file_index"])
+
+    def data_path(self, chunk: int, file: int) -> str:
+        """Path of a table, relative to the dataset."""
+        return self.info["data_path"].format(chunk_index=chunk, file_index=file)
+
+    def first_row(self, episode: int) -> int:
+        """Where an episode begins in its table's file."""
+        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_file(episode)]
+
+    @cached_property
+    def _file_starts(self) -> dict[Path, int]:
+        starts: dict[Path, int] = {}
+        for episode, row in enumerate(self.episodes):
+            starts.setdefault(self.data_file(episode), row["dataset_from_index"])
+        return starts
+
+    def video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
+        """Decode a video feature: (H, W, 3) uint8, or (H, W) float32 metres."""
+        from lerobot.configs.video import DepthEncoderConfig
+        from lerobot.datasets.depth_utils import dequantize_depth
+        from lerobot.datasets.video_utils import decode_video_frames
+
+        row, info = self.episodes[episode], self.features[key].get("info") or {}
+        place = {part: row[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
+        file = self.folder / self.info["video_path"].format(video_key=key, **place)
+        is_depth = is_depth_feature(self.features[key])
+        for first in range(0, len(timestamps), VIDEO_FRAMES):
+            moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
+            images = decode_video_frames(file, moments, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
+            if is_depth:
+                coding = DepthEncoderConfig.from_video_info(info)
+                images = dequantize_depth(
+                    images, coding.depth_min, coding.depth_max, coding.shift, coding.use_log, output_unit="m"
+                )
+                yield from images[:, 0].numpy().astype(np.float32)
+            else:
+                yield from images.permute(0, 2, 3, 1).contiguous().numpy()
+
+
+class EpisodeTables:
+    """Reads the rows of single episodes from one of a dataset's files, however its row groups are cut.
+
+    Args:
+        dataset: the dataset.
+        file: one of its tables' files.
+        columns: which columns; by default all.
+    """
+
+    def __init__(self, dataset: SourceDataset, file: Path, columns: list[str] | None = None):
+        self._dataset = dataset
+        self._columns = columns
+        self._file = pq.ParquetFile(file)
+        counts = [self._file.metadata.row_group(group).num_rows for group in range(self._file.num_row_groups)]
+        self._starts = np.cumsum([0, *counts])
+
+    def read(self, episode: int) -> pa.Table:
+        """Return an episode's rows."""
+        first = self._dataset.first_row(episode)
+        count = self._dataset.episodes[episode]["length"]
+        begin = int(np.searchsorted(self._starts, first, side="right")) - 1
+        end = int(np.searchsorted(self._starts, first + count, side="left"))
+        table = self._file.read_row_groups(list(range(begin, end)), columns=self._columns)
+        return table.slice(first - int(self._starts[begin]), count)
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Puts together the frames of one camera.
+
+    Args:
+        dataset: where they are.
+        camera: which camera.
+        workspace: what its views are to show.
+        depth: whether depth is wanted.
+        gripper: whether the gripper's state is wanted.
+        calibration: the camera's, where the dataset has none of its own.
+    """
+
+    dataset: SourceDataset
+    camera: str
+    workspace: Workspace
+    depth: bool
+    gripper: bool
+    calibration: Calibration | None = None
+
+    def columns(self) -> list[str]:
+        """Return the columns of the tables that `frames` reads; what is video is not among them."""
+        features = self.dataset.features
+        wanted = [keys.rgb(self.camera), "timestamp"]
+        wanted += [keys.depth(self.camera)] if self.depth else []
+        wanted += [keys.STATE] if self.gripper else []
+        if self.calibration is None:
+            wanted += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        return [key for key in wanted if features.get(key, {}).get("dtype") != "video"]
+
+    def missing(self) -> list[str]:
+        """Return what is wanted and not in the dataset."""
+        features = self.dataset.features
+        missing = [key for key in self.columns() if key not in features]
+        if (
+            self.depth
+            and keys.depth(self.camera) in features
+            and not is_depth_feature(features[keys.depth(self.camera)])
+        ):
+            missing.append(f"{keys.depth(self.camera)} as a depth feature")
+        if self.gripper and keys.STATE in features and gripper_entries(features) is None:
+            missing.append(f"{', '.join(keys.STATE_NAMES)} among the names of {keys.STATE}")
+        return missing
+
+    def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
+        """Yield the frames of an episode, whose rows `table` holds.
+
+        Raises:
+            CalibrationError: if a frame's calibration is none.
+        """
+        timestamps = table["timestamp"].to_numpy()
+        colors = self._images(keys.rgb(self.camera), episode, table, timestamps)
+        depths = self._images(keys.depth(self.camera), episode, table, timestamps) if self.depth else repeat(None)
+        states: Iterator[Any] = repeat(None)
+        if self.gripper:
+            states = iter(vectors(table, keys.STATE)[:, gripper_entries(self.dataset.features)])
+        matrices: Iterator[Any] = repeat(None)
+        if self.calibration is None:
+            stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
+            matrices = zip(*stored, strict=True)
+        moments = zip(colors, depths, states, matrices, strict=False)
+        for index, (rgb, depth, state, stated) in enumerate(islice(moments, len(timestamps))):
+            try:
+                camera = self._camera(stated, *rgb.shape[:2])
+            except CalibrationError as error:
+                raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
+            yield Frame(rgb, depth, camera, self.workspace, state)
+
+    def _camera(self, matrices: tuple[NDArray, NDArray] | None, height: int, width: int) -> Camera:
+        if matrices is not None:
+            return stored_camera(*matrices, height, width)
+        assert self.calibration is not None
+        camera = self.calibration.camera(self.camera)
+        if (camera.height, camera.width) != (height, width):
+            raise CalibrationError(
+                f"the calibration is for {camera.height} x {camera.width} pixels, the images have {height} x {width}"
+            )
+        return camera
+
+    def _images(self, key: str, episode: int, table: pa.Table, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
+        feature = self.dataset.features[key]
+        if feature["dtype"] == "video":
+            yield from self.dataset.video_frames(key, episode, timestamps)
+            return
+        for cell in table[key]:
+            data = cell["bytes"].as_py()
+            if not is_depth_feature(feature):
+                yield decode_rgb(data)
+                continue
+            depth = decode_depth(data)
+            in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
+            yield depth / np.float32(1000) if in_millimetres and depth.dtype.kind == "f" else depth
+
+
+def is_depth_feature(feature: dict[str, Any]) -> bool:
+    """Whether a feature holds distances rather than colour."""
+    return bool((feature.get("info") or {}).get("is_depth_map"))
+
+
+def gripper_entries(features: Features) -> list[int] | None:
+    """Return which entries of the state are the gripper's x, y, z, yaw and aperture; None if they are not there."""
+    names = features.get(keys.STATE, {}).get("names")
+    if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
+        return None
+    return [names.index(name) for name in keys.STATE_NAMES]
+
+
+def vectors(table: pa.Table, column: str) -> NDArray:
+    """Return a column of equally long lists as an array (rows, length)."""
+    return table[column].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(table), -1)
