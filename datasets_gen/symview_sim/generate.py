@@ -101,9 +101,7 @@ def generate(config: GenerateConfig) -> Path:
     if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):
         logger.info("%s is complete already", target)
         return target
-    open_partial(recording.folder, recording.description(), config.resume)
-    for pieces in ("episodes", "shards"):
-        (recording.folder / pieces).mkdir(exist_ok=True)
+    _begin(recording, config.resume)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
     with EXECUTORS[config.executor](config.num_workers) as executor:
@@ -142,6 +140,12 @@ def _plan(config: GenerateConfig, target: Path) -> Recording:
     )
     env.close()
     return recording
+
+
+def _begin(recording: Recording, resume: bool) -> None:
+    open_partial(recording.folder, recording.description(), resume)
+    for pieces in ("episodes", "shards"):
+        (recording.folder / pieces).mkdir(exist_ok=True)
 
 
 def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:

@@ -259,7 +259,7 @@ def _begun(folder, **options):
     from symview_sim import generate as module
 
     plan = module._plan(config(folder / "data", **options), folder / "data")
-    module._open(plan, resume=False)
+    module._begin(plan, resume=False)
     for episode in range(2):
         recording.record_episode(plan, episode)
     return plan
