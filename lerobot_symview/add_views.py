@@ -27,7 +27,7 @@ from lerobot_symview.derivation import (
 )
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, calibration_features, stored_workspace, view_features
-from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.source_dataset import EpisodeTables, SourceDataset
 from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
 from lerobot_symview.workspace import check_visible
@@ -92,21 +92,19 @@ def add_views(config: AddViewsConfig) -> Path:
     bit and videos as files; statistics cover the new keys.
     """
     source, target = SourceDataset(config.dataset.folder()), config.target().folder()
-    derivation = _plan(config, source, partial_folder(target))
-    description = _description(config, derivation, source)
-    if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
-        logger.info("%s is complete already", target)
-        return target
-    _check_first_frame(derivation, source)
-    parts = cut_parts(source)
-    open_partial(derivation.folder, description, config.resume)
-    names = ", ".join(derivation.views)
-    with (
-        EXECUTORS["local"](config.num_workers) as executor,
-        tqdm(desc=names, total=source.info["total_frames"], unit="frame") as bar,
-    ):
-        for frames in executor.run(partial(write_part, derivation), list(enumerate(parts))):
-            bar.update(frames)
+    with EXECUTORS["local"](config.num_workers, "lerobot_symview.derivation") as executor:
+        derivation = _plan(config, source, partial_folder(target))
+        description = _description(config, derivation, source)
+        if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
+            logger.info("%s is complete already", target)
+            return target
+        _check_first_frame(derivation, source)
+        parts = cut_parts(source)
+        open_partial(derivation.folder, description, config.resume)
+        names = ", ".join(derivation.views)
+        with tqdm(desc=names, total=source.info["total_frames"], unit="frame") as bar:
+            for frames in executor.run(partial(write_part, derivation), list(enumerate(parts))):
+                bar.update(frames)
     finish(derivation, parts, description).rename(target)
     shutil.rmtree(derivation.folder)
     logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
@@ -125,7 +123,8 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         )
         added |= calibration_features(config.camera)
     for name, view in views.items():
-        added |= view_features(config.camera, name, view, workspace)
+        stated = plain_calibration(calibration) if calibration is not None else None
+        added |= view_features(config.camera, name, view, workspace, stated)
     kept = None if config.keep is None else {keys.rgb(name) for name in config.keep}
     dropped = [
         key
@@ -134,18 +133,12 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     ]
     schema = derived_schema(source, dropped, added)
     derivation = Derivation(source.folder, folder, config.camera, views, workspace, calibration, dropped, added, schema)
-    _check_inputs(config, source.features, derivation.reader(source), added)
+    derivation.reader(source).check()
+    _check_names(config, source.features, added)
     return derivation
 
 
-def _check_inputs(config: AddViewsConfig, features: Features, reader: FrameReader, added: Features) -> None:
-    missing = reader.missing()
-    if missing:
-        cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
-        remedy = f"--camera={config.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
-        if reader.gripper:
-            remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
-        raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
+def _check_names(config: AddViewsConfig, features: Features, added: Features) -> None:
     existing = [key for key in added if key in features]
     if existing:
         raise ValueError(f"the dataset has {', '.join(existing)} already: take them out of --views or --calibration")

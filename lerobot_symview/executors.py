@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -50,11 +51,14 @@ class ProcessExecutor:
 
     Args:
         num_workers: how many processes.
+        module: what they are going to run; imported at once, while the caller prepares their work.
     """
 
-    def __init__(self, num_workers: int):
+    def __init__(self, num_workers: int, module: str):
         context = multiprocessing.get_context("forkserver")
         self._pool = ProcessPoolExecutor(num_workers, mp_context=context, initializer=_start_worker)
+        for _ in range(num_workers):
+            self._pool.submit(import_module, module)
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
         """Yield the results as they come.
@@ -84,9 +88,10 @@ class RayExecutor:
 
     Args:
         num_workers: processes of a local cluster.
+        module: what they are going to run, imported when they do.
     """
 
-    def __init__(self, num_workers: int):
+    def __init__(self, num_workers: int, module: str):
         try:
             import ray
         except ImportError:
@@ -119,8 +124,8 @@ class RayExecutor:
         self._ray.shutdown()
 
 
-EXECUTORS: dict[str, Callable[[int], Executor]] = {
-    "local": lambda num_workers: SerialExecutor() if num_workers == 1 else ProcessExecutor(num_workers),
+EXECUTORS: dict[str, Callable[[int, str], Executor]] = {
+    "local": lambda workers, module: SerialExecutor() if workers == 1 else ProcessExecutor(workers, module),
     "ray": RayExecutor,
 }
 

@@ -55,9 +55,16 @@ def calibration_features(name: str) -> Features:
     }
 
 
-def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:
-    """Declare the outputs of `view`, with everything needed to compute them again."""
+def view_features(
+    camera: str, name: str, view: View, workspace: Workspace, calibration: dict[str, Any] | None = None
+) -> Features:
+    """Declare the outputs of `view`, with everything needed to compute them again.
+
+    `calibration` is the content of the file that stated it; without one it is in the frames.
+    """
     facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
+    if calibration is not None:
+        facts["calibration"] = calibration
     declare = {"rgb": color_feature, "height": metric_feature}
     return {
         keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()

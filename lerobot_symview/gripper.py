@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import array_api_compat
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lerobot_symview.workspace import Workspace
@@ -40,11 +42,19 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
         finger's border pixels are covered in part, so the picture moves smoothly with the gripper; it turns and
         mirrors exactly with the state, by any angle.
     """
+    shape = shape or GripperShape()
     xp = array_api_compat.array_namespace(state)
-    centers = ((xp.arange(pixels, dtype=state.dtype, device=array_api_compat.device(state)) + 0.5) / pixels - 0.5) * (
-        workspace.size
-    )
-    return _draw(state, centers, centers, workspace, workspace.size / pixels, shape or GripperShape())
+    device = array_api_compat.device(state)
+    centers = ((xp.arange(pixels, dtype=state.dtype, device=device) + 0.5) / pixels - 0.5) * workspace.size
+    x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
+    forward = centers[:, None] - x
+    sideward = centers[None, :] - y
+    along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # a finger stands on either side: |.| draws both
+    across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
+    resolution = workspace.size / pixels
+    finger_center = (aperture * shape.opening + shape.finger) / 2
+    coverage = _ramp(xp, xp.abs(along - finger_center), shape, resolution) * _ramp(xp, across, shape, resolution)
+    return coverage * z / workspace.height_limit
 
 
 def gripper_picture(
@@ -55,31 +65,35 @@ def gripper_picture(
     Only the square that the gripper can fill is computed.
     """
     shape = shape or GripperShape()
-    state = np.asarray(state, dtype=np.float64)
+    x, y, z, yaw, aperture = np.asarray(state, dtype=np.float64).tolist()
     resolution = workspace.size / pixels
-    reach = np.hypot(max(state[4], 0.0) * shape.opening / 2 + shape.finger, shape.finger / 2) + resolution
+    reach = math.hypot(max(aperture, 0.0) * shape.opening / 2 + shape.finger, shape.finger / 2) + resolution
     spans = []
-    for center in state[:2]:
-        first, last = (center + np.array([-reach, reach])) / resolution + pixels / 2
-        spans.append(slice(*np.clip([np.floor(first), np.ceil(last)], 0, pixels).astype(int)))
-    centers = ((np.arange(pixels) + 0.5) / pixels - 0.5) * workspace.size
+    for center in (x, y):
+        first, last = (center - reach) / resolution + pixels / 2, (center + reach) / resolution + pixels / 2
+        spans.append((max(math.floor(first), 0), min(math.ceil(last), pixels)))
     picture = np.zeros((pixels, pixels), dtype=np.uint8)
-    drawn = _draw(state, centers[spans[0]], centers[spans[1]], workspace, resolution, shape)
-    picture[spans[0], spans[1]] = np.rint(255 * np.clip(drawn, 0.0, 1.0))
+    finger_center = (aperture * shape.opening + shape.finger) / 2
+    place = (x, y, math.cos(yaw), math.sin(yaw), finger_center, shape.finger / 2)
+    _paint(picture, spans[0], spans[1], workspace.size, place, z / workspace.height_limit)
     return picture
 
 
-def _draw(state: Any, rows: Any, columns: Any, workspace: Workspace, resolution: float, shape: GripperShape) -> Any:
-    """Draw at the pixels whose centres lie at `rows` (R,) and `columns` (C,) metres: (..., R, C)."""
-    xp = array_api_compat.array_namespace(state)
-    x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
-    forward = rows[:, None] - x
-    sideward = columns[None, :] - y
-    along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # a finger stands on either side: |.| draws both
-    across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
-    finger_center = (aperture * shape.opening + shape.finger) / 2
-    coverage = _ramp(xp, xp.abs(along - finger_center), shape, resolution) * _ramp(xp, across, shape, resolution)
-    return coverage * z / workspace.height_limit
+@njit(cache=True, nogil=True)
+def _paint(picture, rows, columns, size, place, brightness):  # type: ignore[no-untyped-def]
+    """Draw as `gripper_image` does, pixel by pixel."""
+    pixels = picture.shape[0]
+    resolution = size / pixels
+    x, y, cos, sin, finger_center, half = place
+    for i in range(rows[0], rows[1]):
+        forward = ((i + 0.5) / pixels - 0.5) * size - x
+        for j in range(columns[0], columns[1]):
+            sideward = ((j + 0.5) / pixels - 0.5) * size - y
+            along = abs(forward * cos + sideward * sin)
+            across = abs(sideward * cos - forward * sin)
+            inside = min(max((half - abs(along - finger_center)) / resolution + 0.5, 0.0), 1.0)
+            beside = min(max((half - across) / resolution + 0.5, 0.0), 1.0)
+            picture[i, j] = np.rint(255 * min(max(inside * beside * brightness, 0.0), 1.0))
 
 
 def _ramp(xp: Any, distance: Any, shape: GripperShape, resolution: float) -> Any:

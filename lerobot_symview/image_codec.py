@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Buffer
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ PNG_LEVEL = 1  # LeRobot's own: level 6 takes seven times as long for a tenth le
 NO_COMPRESSION = 1  # TIFF's code for none
 
 
-def decode_rgb(data: bytes) -> NDArray[np.uint8]:
+def decode_rgb(data: Buffer) -> NDArray[np.uint8]:
     """Return (H, W, 3) uint8 of an encoded colour image.
 
     Raises:
@@ -19,7 +21,7 @@ def decode_rgb(data: bytes) -> NDArray[np.uint8]:
     return np.asarray(_decode(data, cv2.IMREAD_COLOR_RGB), dtype=np.uint8)
 
 
-def decode_depth(data: bytes) -> NDArray:
+def decode_depth(data: Buffer) -> NDArray:
     """Return (H, W) float32 or uint16, whatever was encoded.
 
     Raises:
@@ -41,10 +43,10 @@ def encode_metres(image: NDArray[np.float32]) -> bytes:
     return _encode(".tiff", image, [cv2.IMWRITE_TIFF_COMPRESSION, NO_COMPRESSION])
 
 
-def _decode(data: bytes, flags: int) -> NDArray:
+def _decode(data: Buffer, flags: int) -> NDArray:
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     if image is None:
-        raise ValueError(f"{len(data)} bytes that are no image OpenCV can read")
+        raise ValueError(f"{memoryview(data).nbytes} bytes that are no image OpenCV can read")
     return image
 
 

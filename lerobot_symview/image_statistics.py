@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: what lies outside counts, for quantiles, as lying at the border
+LEVELS = LOWEST + STEP * np.arange(round((HIGHEST - LOWEST) / STEP) + 1)
 
 
 @dataclass(eq=False)
@@ -34,7 +35,7 @@ class ImageStatistics:
     @classmethod
     def empty(cls, kind: Literal["rgb", "height"]) -> Self:
         """Return the statistics of no image."""
-        channels, bins = (3, 256) if kind == "rgb" else (1, round((HIGHEST - LOWEST) / STEP) + 1)
+        channels, bins = (3, 256) if kind == "rgb" else (1, len(LEVELS))
         sums = np.tile([np.inf, -np.inf, 0.0, 0.0], (channels, 1))
         return cls(kind, 0, np.zeros((channels, bins), dtype=np.int64), sums)
 
@@ -56,26 +57,23 @@ class ImageStatistics:
 
     def summary(self) -> dict[str, Any]:
         """Return LeRobot's statistics of an image feature: lists of shape (C, 1, 1), and the number of images."""
-        total = self.counts.sum(axis=1)
+        cumulative = self.counts.cumsum(axis=1)
+        total = cumulative[:, -1]
         if self.kind == "rgb":
             levels: NDArray = np.arange(256) / 255
-            minimum, maximum = (levels[[f(np.flatnonzero(c)) for c in self.counts]] for f in (np.min, np.max))
+            seen = self.counts > 0
+            minimum, maximum = levels[seen.argmax(axis=1)], levels[255 - seen[:, ::-1].argmax(axis=1)]
             mean = self.counts @ levels / total
             variance = self.counts @ levels**2 / total - mean**2
         else:
-            levels = LOWEST + STEP * np.arange(self.counts.shape[1])
+            levels = LEVELS
             minimum, maximum = self.sums[:, 0], self.sums[:, 1]
             mean = self.sums[:, 2] / total
             variance = self.sums[:, 3] / total - mean**2
-        values: dict[str, NDArray] = {
-            "min": minimum,
-            "max": maximum,
-            "mean": mean,
-            "std": np.sqrt(np.maximum(variance, 0.0)),
-        }
-        cumulative = self.counts.cumsum(axis=1)
-        for name, share in QUANTILES.items():
-            values[name] = levels[[np.searchsorted(c, share * c[-1]) for c in cumulative]]
+        values = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(np.maximum(variance, 0.0))}
+        shares = np.array(list(QUANTILES.values()))
+        quantiles = np.array([levels[np.searchsorted(c, shares * c[-1])] for c in cumulative])
+        values |= dict(zip(QUANTILES, quantiles.T, strict=True))
         return {name: value.reshape(-1, 1, 1).tolist() for name, value in values.items()} | {"count": [self.images]}
 
 
@@ -87,10 +85,12 @@ def constant_summary(values: NDArray[np.floating], count: int) -> dict[str, Any]
 
 @njit(cache=True, nogil=True)
 def _count_levels(image, counts):  # type: ignore[no-untyped-def]
+    red, green, blue = counts
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
-            for channel in range(image.shape[2]):
-                counts[channel, image[i, j, channel]] += 1
+            red[image[i, j, 0]] += 1
+            green[image[i, j, 1]] += 1
+            blue[image[i, j, 2]] += 1
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,7 @@ Tables are read as they are: LeRobot itself, which takes seconds to import, is n
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Buffer, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice, repeat
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.calibration import Calibration
-from lerobot_symview.camera import CalibrationError, Camera, stored_camera
+from lerobot_symview.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
 from lerobot_symview.cli import CommandError
 from lerobot_symview.features import Features
 from lerobot_symview.image_codec import decode_depth, decode_rgb
@@ -85,8 +85,31 @@ class SourceDataset:
             starts.setdefault(self.data_file(episode), row["dataset_from_index"])
         return starts
 
-    def video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
-        """Decode a video feature: (H, W, 3) uint8, or (H, W) float32 metres."""
+    def images(self, key: str, episode: int, table: pa.Table) -> Iterator[NDArray]:
+        """Decode an image or video feature: (H, W, 3) uint8, or (H, W) distances, float metres or integer millimetres.
+
+        Args:
+            key: the feature.
+            episode: which episode.
+            table: rows of it; the images are those of these rows.
+        """
+        feature = self.features[key]
+        if feature["dtype"] == "video":
+            yield from self._video_frames(key, episode, table["timestamp"].to_numpy())
+            return
+        for cell in table[key]:
+            yield self.decode(key, cell["bytes"].as_buffer())
+
+    def decode(self, key: str, data: Buffer) -> NDArray:
+        """Decode one image of an image feature, as `images` yields it."""
+        feature = self.features[key]
+        if not is_depth_feature(feature):
+            return decode_rgb(data)
+        depth = decode_depth(data)
+        in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
+        return depth / np.float32(MILLIMETRES_PER_METRE) if in_millimetres and depth.dtype.kind == "f" else depth
+
+    def _video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
         from lerobot.configs.video import DepthEncoderConfig
         from lerobot.datasets.depth_utils import dequantize_depth
         from lerobot.datasets.video_utils import decode_video_frames
@@ -130,7 +153,7 @@ class EpisodeTables:
         count = self._dataset.episodes[episode]["length"]
         begin = int(np.searchsorted(self._starts, first, side="right")) - 1
         end = int(np.searchsorted(self._starts, first + count, side="left"))
-        table = self._file.read_row_groups(list(range(begin, end)), columns=self._columns)
+        table = self._file.read_row_groups(list(range(begin, end)), columns=self._columns, use_threads=False)
         return table.slice(first - int(self._starts[begin]), count)
 
 
@@ -164,19 +187,22 @@ class FrameReader:
             wanted += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
         return [key for key in wanted if features.get(key, {}).get("dtype") != "video"]
 
-    def missing(self) -> list[str]:
-        """Return what is wanted and not in the dataset."""
+    def check(self) -> None:
+        """Raise a ValueError that names what is wanted and not in the dataset, and what can be done."""
         features = self.dataset.features
         missing = [key for key in self.columns() if key not in features]
-        if (
-            self.depth
-            and keys.depth(self.camera) in features
-            and not is_depth_feature(features[keys.depth(self.camera)])
-        ):
-            missing.append(f"{keys.depth(self.camera)} as a depth feature")
+        depth = keys.depth(self.camera)
+        if self.depth and depth in features and not is_depth_feature(features[depth]):
+            missing.append(f"{depth} as a depth feature")
         if self.gripper and keys.STATE in features and gripper_entries(features) is None:
             missing.append(f"{', '.join(keys.STATE_NAMES)} among the names of {keys.STATE}")
-        return missing
+        if not missing:
+            return
+        cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
+        remedy = f"--camera={self.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
+        if self.gripper:
+            remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
+        raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
 
     def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
         """Yield the frames of an episode, whose rows `table` holds.
@@ -184,9 +210,8 @@ class FrameReader:
         Raises:
             CalibrationError: if a frame's calibration is none.
         """
-        timestamps = table["timestamp"].to_numpy()
-        colors = self._images(keys.rgb(self.camera), episode, table, timestamps)
-        depths = self._images(keys.depth(self.camera), episode, table, timestamps) if self.depth else repeat(None)
+        colors = self.dataset.images(keys.rgb(self.camera), episode, table)
+        depths = self.dataset.images(keys.depth(self.camera), episode, table) if self.depth else repeat(None)
         states: Iterator[Any] = repeat(None)
         if self.gripper:
             states = iter(vectors(table, keys.STATE)[:, gripper_entries(self.dataset.features)])
@@ -195,7 +220,7 @@ class FrameReader:
             stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
             matrices = zip(*stored, strict=True)
         moments = zip(colors, depths, states, matrices, strict=False)
-        for index, (rgb, depth, state, stated) in enumerate(islice(moments, len(timestamps))):
+        for index, (rgb, depth, state, stated) in enumerate(islice(moments, len(table))):
             try:
                 camera = self._camera(stated, *rgb.shape[:2])
             except CalibrationError as error:
@@ -212,20 +237,6 @@ class FrameReader:
                 f"the calibration is for {camera.height} x {camera.width} pixels, the images have {height} x {width}"
             )
         return camera
-
-    def _images(self, key: str, episode: int, table: pa.Table, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
-        feature = self.dataset.features[key]
-        if feature["dtype"] == "video":
-            yield from self.dataset.video_frames(key, episode, timestamps)
-            return
-        for cell in table[key]:
-            data = cell["bytes"].as_py()
-            if not is_depth_feature(feature):
-                yield decode_rgb(data)
-                continue
-            depth = decode_depth(data)
-            in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
-            yield depth / np.float32(1000) if in_millimetres and depth.dtype.kind == "f" else depth
 
 
 def is_depth_feature(feature: dict[str, Any]) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar, Literal, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -175,7 +176,7 @@ class ReprojectedView:
             colors, height = fill_local(colors, seen), fill_local(height, seen)
         images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
         if self.mask:
-            images["reproj_seen"] = np.repeat(np.where(seen, np.uint8(255), np.uint8(0))[..., None], 3, axis=-1)
+            images["reproj_seen"] = _three_channels(seen.astype(np.uint8) * np.uint8(255))
         return {output: images[output] for output in self.outputs}
 
     def _ceiling(self, frame: Frame) -> float:
@@ -228,14 +229,17 @@ class PerspectiveView:
         if self.gripper:
             if frame.gripper is None:
                 raise ValueError("the gripper image needs the gripper's state; without it, gripper=false")
-            grey = gripper_picture(frame.gripper, frame.workspace, self.size)
-            images["persp_gripper"] = np.repeat(grey[..., None], 3, axis=-1)
+            images["persp_gripper"] = _three_channels(gripper_picture(frame.gripper, frame.workspace, self.size))
         return images
 
 
 @lru_cache(maxsize=64)
 def _enlarged(camera: Camera, factor: int) -> Camera:
     return camera.enlarged(factor)
+
+
+def _three_channels(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
 
 
 @lru_cache(maxsize=8)

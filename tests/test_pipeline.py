@@ -96,28 +96,90 @@ def test_lerobots_commands_list_our_options():
         assert option in evaluate.stdout
 
 
-def test_a_stock_policy_trains_on_the_view_dataset(with_views, tmp_path):
-    result = run(
-        "lerobot-train",
-        "--dataset.repo_id=test/with_views",
-        f"--dataset.root={with_views}",
-        "--policy.type=act",
-        "--policy.pretrained_backbone_weights=null",
-        '--policy.input_features={"observation.images.side_reproj": {"type": "VISUAL", "shape": [3, 76, 76]}, '
-        '"observation.state": {"type": "STATE", "shape": [5]}}',
-        "--policy.dim_model=32",
-        "--policy.n_heads=2",
-        "--policy.dim_feedforward=32",
-        "--policy.device=cpu",
-        "--policy.push_to_hub=false",
-        "--steps=1",
-        "--batch_size=2",
-        "--num_workers=0",
-        "--env_eval_freq=0",
-        f"--output_dir={tmp_path / 'act'}",
+def test_a_stock_policy_trains_on_views_alone_and_is_evaluated_on_them(recorded, tmp_path):
+    """As docs/views.md says: nothing of ours is in the policy, the environment makes the view."""
+    views = ("--env.views=[reproj]", "--env.view_size=76", "--env.reproj.height=false")
+    commands = [
+        (
+            "symview-add-views",
+            "--dataset.repo_id=test/recorded",
+            f"--root={recorded}",
+            "--new_repo_id=test/stock",
+            f"--new_root={tmp_path / 'views'}",
+            "--size=76",
+            "--reproj.height=false",
+            "--keep=[]",
+        ),
+        (
+            "lerobot-train",
+            "--dataset.repo_id=test/stock",
+            f"--dataset.root={tmp_path / 'views'}",
+            "--policy.type=act",
+            "--policy.pretrained_backbone_weights=null",
+            "--policy.dim_model=32",
+            "--policy.n_heads=2",
+            "--policy.dim_feedforward=32",
+            "--policy.device=cpu",
+            "--policy.push_to_hub=false",
+            "--steps=2",
+            "--batch_size=2",
+            "--num_workers=0",
+            "--env_eval_freq=0",
+            f"--output_dir={tmp_path / 'act'}",
+        ),
+        (
+            "lerobot-eval",
+            f"--policy.path={tmp_path / 'act' / 'checkpoints' / 'last' / 'pretrained_model'}",
+            "--policy.device=cpu",
+            "--env.type=symview",
+            *views,
+            "--env.max_steps=3",
+            "--eval.n_episodes=1",
+            "--eval.batch_size=1",
+            f"--output_dir={tmp_path / 'evaluation'}",
+        ),
+    ]
+    for command in commands:
+        result = run(*command)
+        assert result.returncode == 0, result.stderr[-2000:]
+    assert json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
+    check_views_in_a_stock_pipeline(tmp_path / "act" / "checkpoints" / "last" / "pretrained_model", tmp_path)
+
+
+def check_views_in_a_stock_pipeline(checkpoint, folder):
+    """On a robot: the step is put into the policy's own pipeline, saved, and restored in a fresh process."""
+    script = f"""
+import numpy as np, torch
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.configs.policies import PreTrainedConfig
+import lerobot_policy_symview
+config = PreTrainedConfig.from_pretrained({str(checkpoint)!r})
+preprocessor, _ = make_pre_post_processors(config, pretrained_path={str(folder / "robot")!r})
+observation = {{
+    "observation.images.side": torch.full((3, 152, 152), 0.5),
+    "observation.images.side_depth": torch.full((1, 152, 152), 0.8),
+    "observation.state": torch.tensor([0.0, 0.0, 0.2, 0.0, 1.0]),
+}}
+print(tuple(preprocessor(observation)["observation.images.side_reproj"].shape))
+"""
+    from lerobot.policies.factory import PreTrainedConfig, make_pre_post_processors
+
+    from lerobot_policy_symview import ViewsProcessorStep
+    from lerobot_symview.calibration import Calibration, plain_calibration
+    from tests.conftest import make_camera
+
+    config = PreTrainedConfig.from_pretrained(str(checkpoint))
+    preprocessor, postprocessor = make_pre_post_processors(config, pretrained_path=str(checkpoint))
+    names = [type(step).__name__ for step in preprocessor.steps]
+    step = ViewsProcessorStep(
+        views={"reproj": {"size": 76, "height": False}},
+        calibration=plain_calibration(Calibration({"side": make_camera()})),
     )
-    assert result.returncode == 0, result.stderr[-2000:]
-    assert (tmp_path / "act" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+    preprocessor.steps.insert(names.index("NormalizerProcessorStep"), step)
+    preprocessor.save_pretrained(folder / "robot")
+    postprocessor.save_pretrained(folder / "robot")
+    restored = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert restored.stdout.strip().endswith("(1, 3, 76, 76)"), restored.stderr[-2000:]
 
 
 @pytest.mark.parametrize(
@@ -157,14 +219,13 @@ def test_commands_explain_themselves(command):
     assert run(command, "--version").stdout.startswith(f"{command} 0.")
 
 
-def test_a_preview_is_a_picture(with_views, tmp_path):
+def test_a_preview_is_a_picture_a_page_and_a_recording(recorded, tmp_path):
     from PIL import Image
 
-    output = tmp_path / "frame.png"
-    result = run(
-        "symview-preview", "--dataset.repo_id=test/v", f"--dataset.root={with_views}", "--frame=3", f"--output={output}"
-    )
+    result = run("symview-preview", "--dataset.repo_id=test/r", f"--root={recorded}", f"--output_dir={tmp_path}")
     assert result.returncode == 0, result.stderr
-    with Image.open(output) as picture:
-        width, height = picture.size
-    assert width > 5 * height
+    assert "px/mm" in result.stderr
+    with Image.open(tmp_path / "preview.png") as picture:
+        assert picture.size[0] > 1000
+    assert (tmp_path / "preview.html").read_text().count("data:image/png;base64,") == 4 * 7
+    assert (tmp_path / "preview.rrd").stat().st_size > 100_000

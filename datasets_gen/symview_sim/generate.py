@@ -104,7 +104,7 @@ def generate(config: GenerateConfig) -> Path:
     _begin(recording, config.resume)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
-    with EXECUTORS[config.executor](config.num_workers) as executor:
+    with EXECUTORS[config.executor](config.num_workers, "symview_sim.recording") as executor:
         with tqdm(desc=config.env.task, total=config.num_episodes, initial=len(attempts), unit="episode") as bar:
             done, tried = len(attempts), sum(attempts.values())
             for taken in executor.run(partial(record_episode, recording), missing):

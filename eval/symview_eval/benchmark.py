@@ -1,4 +1,4 @@
-"""`symview-benchmark`: what experts achieve and what a simulated step costs, as tables or JSON."""
+"""`symview-benchmark`: what experts achieve, what a simulated step and a view cost, as tables or JSON."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from tqdm import tqdm
 
 from lerobot_symview.cli import USAGE, run_command
 from lerobot_symview.names import lookup
+from symview_eval.clock import Clock
+from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from symview_sim.settings import EnvSettings
 from symview_sim.tasks import TASK_NAMES
@@ -29,7 +31,8 @@ TIMED = {
 
 EXAMPLES = """\
   symview-benchmark experts --seeds=200
-  symview-benchmark env --json=true"""
+  symview-benchmark env --json=true
+  symview-benchmark views"""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
     """
     env = config.env.make()
     client, arm = env.scene.client, env.scene.arm
-    parts = {name: _Timed(client, function) for name, function in TIMED.items()}
+    parts = {name: Clock(client, function) for name, function in TIMED.items()}
     resets, steps = [], []
     spent: dict[str, list[float]] = {name: [] for name in parts}
     start = time.perf_counter()
@@ -133,22 +136,6 @@ def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
     }
 
 
-class _Timed:
-    """Replaces a function of a simulator by itself with a clock."""
-
-    def __init__(self, client: Any, name: str):
-        self.milliseconds = 0.0
-        function = getattr(client, name)
-
-        def timed(*arguments: Any, **options: Any) -> Any:
-            start = time.perf_counter()
-            result = function(*arguments, **options)
-            self.milliseconds += 1000 * (time.perf_counter() - start)
-            return result
-
-        setattr(client, name, timed)
-
-
 def _saved_per_second(config: EnvBenchmark) -> float:
     import lerobot.datasets  # noqa: F401  imported before the clock starts: it takes longer than the writing
 
@@ -180,13 +167,14 @@ def _print(results: dict[str, Any], as_json: bool) -> None:
         return
     for name, value in results.items():
         values = value if isinstance(value, dict) else {"": value}
-        cells = "  ".join(f"{label:>11} {number:7.3g}" for label, number in values.items())
-        sys.stdout.write(f"{name:22}{cells}\n")
+        cells = "  ".join(f"{label:>11} {number:7.4g}" for label, number in values.items())
+        sys.stdout.write(f"{name:28}{cells}\n")
 
 
 SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "experts": (ExpertsBenchmark, benchmark_experts),
     "env": (EnvBenchmark, benchmark_env),
+    "views": (ViewsBenchmark, benchmark_views),
 }
 
 

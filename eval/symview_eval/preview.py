@@ -1,100 +1,254 @@
-"""`symview-preview`: every image of one moment of a dataset, side by side."""
+"""`symview-preview`: what a dataset's camera sees and what its views make of it, before or after they are added."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from tqdm import tqdm
 
+from lerobot_symview import keys
+from lerobot_symview.calibration import read_calibration
+from lerobot_symview.camera import Camera, project
 from lerobot_symview.cli import CommandError, DatasetTarget, run_command
+from lerobot_symview.features import stored_workspace
+from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, choose_views
+from lerobot_symview.workspace import MINIMUM_VISIBLE, Workspace
+from symview_eval.contact_sheet import Row, grey, montage, page, with_outline
+from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
 
 EXAMPLES = """\
-  symview-preview --dataset.repo_id=me/picking_views --frame=3 --output=frame.png"""
+  symview-preview --dataset.repo_id=me/picking
+  symview-preview --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --episodes='[0, 7]' \\
+      --reproj.source_scale=2 --output_dir=preview"""
 
-TILE, GAP, LABEL = 228, 8, 24  # pixels
-TITLES = {
-    "side": "side camera",
-    "side_reproj": "reprojected (RGBD)",
-    "side_reproj_height": "reprojected height",
-    "side_persp": "perspective (RGB)",
-    "side_persp_gripper": "gripper image",
-    "top": "oracle from above",
-}
+LATTICE = 9  # points per side of the workspace at which the camera's resolution is measured
+MILLIMETRE = 0.001
 
 
 @dataclass(frozen=True)
 class PreviewConfig:
-    """Draw every image of one frame of a dataset side by side into a PNG."""
+    """Show moments of a dataset: the camera's image with the workspace, the views, what is seen and what inferred.
+
+    Writes preview.png, preview.html and, for `rerun`, preview.rrd, and warns about a camera that sees too little, views
+    with many holes, and a camera too coarse for them.
+    """
 
     dataset: DatasetTarget
     """The dataset."""
-    frame: int = 0
-    """Index of the frame in the dataset."""
-    images: list[str] | None = None
-    """Which images, without `observation.images.`; by default all but cameras' raw depth."""
-    output: Path = Path("preview.png")
-    """The file to write."""
+    episodes: list[int] = field(default_factory=lambda: [0])
+    """Which episodes."""
+    frames: int = 4
+    """How many moments of each, evenly spaced."""
+    camera: str = "side"
+    """Camera that views are made from; a dataset that holds only views is shown as it is."""
+    views: list[str] | None = None
+    """Which views; by default all the dataset has the images for."""
+    size: int | None = None
+    """Rows and columns of all views, in place of each one's own."""
+    reproj: ReprojectedView = field(default_factory=ReprojectedView)
+    """Options of the view reproj."""
+    persp: PerspectiveView = field(default_factory=PerspectiveView)
+    """Options of the view persp."""
+    calibration: Path | None = None
+    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/views.md."""
+    max_holes: float = 0.5
+    """Share of a reprojected view's pixels that may be inferred without a warning."""
+    rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
+    """Write preview.rrd; by default if rerun is installed."""
+    output_dir: Path = Path("preview")
+    """Folder of the files."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise ValueError(f"--frames must be at least 1, got {self.frames}")
+        if not self.episodes:
+            raise ValueError("--episodes is empty, name at least one")
+        if not 0 <= self.max_holes <= 1:
+            raise ValueError(f"--max_holes must lie in [0, 1], got {self.max_holes}")
 
 
-def frame_images(folder: Path, index: int) -> dict[str, NDArray[np.uint8]]:
-    """Return the images of frame `index` as (H, W, 3) uint8, by camera name; metres are shown as grey levels.
+@dataclass(frozen=True)
+class Moment:
+    """A frame of a dataset: what views are made from, where the dataset has that, and what it stores."""
 
-    Raises:
-        CommandError: if there is no dataset in `folder` or no such frame in it.
-    """
-    if not (folder / "meta" / "info.json").is_file():
-        raise CommandError(f"no dataset at {folder}: check --dataset.repo_id and --dataset.root")
-    from lerobot.datasets import LeRobotDataset
+    episode: int
+    index: int
+    frame: Frame | None
+    stored: dict[str, NDArray]
+    """Every image, by name: colour (H, W, 3) uint8 or distances (H, W)."""
 
-    dataset = LeRobotDataset("local/preview", root=folder, depth_output_unit="m")
-    if not 0 <= index < len(dataset):
-        raise CommandError(f"--frame={index} is outside the dataset's {len(dataset)} frames")
-    item = dataset[index]
-    prefix = "observation.images."
-    return {key.removeprefix(prefix): _as_rgb(item[key].numpy()) for key in dataset.meta.camera_keys}
+    @property
+    def title(self) -> str:
+        """Which moment it is."""
+        return f"episode {self.episode}, frame {self.index}"
 
 
-def _as_rgb(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Turn (3, H, W) in [0, 1] or (1, H, W) metres into (H, W, 3) uint8; metres span black to white."""
-    if len(image) == 3:
-        return np.rint(image * 255).astype(np.uint8).transpose(1, 2, 0)
-    low, high = float(image.min()), float(image.max())
-    grey = np.rint(255 * (image[0] - low) / max(high - low, 1e-6)).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
+def read_moment(source: SourceDataset, reader: FrameReader | None, episode: int, index: int) -> Moment:
+    """Return one frame of an episode."""
+    table = EpisodeTables(source, source.data_file(episode)).read(episode).slice(index, 1)
+    images = [key for key, feature in source.features.items() if feature["dtype"] in ("image", "video")]
+    stored = {key.removeprefix(keys.rgb("")): next(source.images(key, episode, table)) for key in images}
+    return Moment(episode, index, next(reader.frames(episode, table)) if reader else None, stored)
 
 
-def montage(images: dict[str, NDArray[np.uint8]]) -> Image.Image:
-    """Return one picture with every image in a row, enlarged and labelled."""
-    width = len(images) * (TILE + GAP) + GAP
-    sheet = Image.new("RGB", (width, TILE + LABEL + 2 * GAP), "white")
-    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(14)
-    for i, (name, image) in enumerate(images.items()):
-        left = GAP + i * (TILE + GAP)
-        draw.text((left, GAP // 2), TITLES.get(name, name), fill="black", font=font)
-        sheet.paste(Image.fromarray(image).resize((TILE, TILE), Image.Resampling.NEAREST), (left, LABEL + GAP // 2))
-    return sheet
+@dataclass(frozen=True)
+class Measures:
+    """What can be measured of one moment."""
+
+    visible: float
+    """Share of the working volume in the camera's image."""
+    resolution: float
+    """The camera's pixels per millimetre of the table, at the least."""
+    holes: dict[str, float]
+    """Share of each view's pixels that are inferred, where that is known."""
 
 
 def preview(config: PreviewConfig) -> Path:
-    """Write the picture that `config` describes and return its path."""
-    images = frame_images(config.dataset.folder(), config.frame)
-    wanted = config.images or [name for name in images if not name.endswith("_depth")]
-    unknown = [name for name in wanted if name not in images]
+    """Write the files that `config` describes and return their folder."""
+    source = SourceDataset(config.dataset.folder())
+    total = len(source.episodes)
+    unknown = [episode for episode in config.episodes if not 0 <= episode < total]
     if unknown:
-        raise ValueError(f"--images names {unknown}, the dataset has {sorted(images)}")
-    config.output.parent.mkdir(parents=True, exist_ok=True)
-    montage({name: images[name] for name in wanted}).save(config.output)
-    logger.info("wrote %s", config.output)
-    return config.output
+        raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0")
+    reader, views = _chosen(config, source)
+    config.output_dir.mkdir(parents=True, exist_ok=True)
+    recording = None
+    if config.rerun and reader is not None:
+        recording = RerunRecording(config.output_dir / "preview.rrd", reader.workspace)
+    rows, measured = [], []
+    for episode in tqdm(config.episodes, desc="preview", unit="episode"):
+        length = source.episodes[episode]["length"]
+        for index in np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist():
+            moment = read_moment(source, reader, episode, index)
+            if moment.frame is None or reader is None:
+                shown = {name: _shown(image) for name, image in moment.stored.items()}
+                rows.append(Row(moment.title, [], shown))
+                continue
+            made = _render(moment.frame, config.camera, views)
+            measures = _measure(moment.frame.camera, reader.workspace, made)
+            rows.append(_row(config.camera, moment, moment.frame, made, measures))
+            measured.append(measures)
+            if recording is not None:
+                recording.add(len(rows) - 1, config.camera, moment.frame, made)
+    if recording is not None:
+        recording.close()
+    warnings = _warnings(config, views, reader.workspace, measured) if reader is not None else []
+    for warning in warnings:
+        logger.warning("%s", warning)
+    montage(rows).save(config.output_dir / "preview.png")
+    (config.output_dir / "preview.html").write_text(page(config.dataset.repo_id, rows, warnings))
+    logger.info("wrote %s", ", ".join(str(file) for file in sorted(config.output_dir.glob("preview.*"))))
+    return config.output_dir
+
+
+def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader | None, dict[str, View]]:
+    """Return what reads the camera's frames, None for a dataset of views alone, and the views to make."""
+    if keys.rgb(config.camera) not in source.features:
+        if config.views is None and config.calibration is None:
+            return None, {}
+        raise ValueError(f"the dataset has no camera {config.camera!r}: check --camera")
+    calibration = read_calibration(config.calibration) if config.calibration else None
+    stated = calibration.workspace if calibration is not None else None
+    options: dict[str, View] = {"reproj": config.reproj, "persp": config.persp}
+    has_depth = keys.depth(config.camera) in source.features
+    names = config.views or [name for name, view in options.items() if has_depth or not view.needs_depth]
+    views = choose_views(names, config.size, options)
+    reader = FrameReader(
+        source,
+        config.camera,
+        stated or stored_workspace(source.features),
+        depth=any(view.needs_depth for view in views.values()),
+        gripper=any(view.needs_gripper for view in views.values()),
+        calibration=calibration,
+    )
+    reader.check()
+    return reader, views
+
+
+def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDArray]:
+    """Return every output of the views, and the mask of those that have one, by name."""
+    images: dict[str, NDArray] = {}
+    for view in views.values():
+        has_mask = any(option.name == "mask" for option in fields(view))
+        images |= (replace(view, mask=True) if has_mask else view).render(frame)
+    return {f"{camera}_{output}": image for output, image in images.items()}
+
+
+def _measure(camera: Camera, workspace: Workspace, made: dict[str, NDArray]) -> Measures:
+    masks = {name.removesuffix("_seen"): image for name, image in made.items() if name.endswith("_seen")}
+    holes = {name: 1.0 - float((mask > 0).mean()) for name, mask in masks.items()}
+    return Measures(workspace.visible_fraction(camera), table_resolution(camera, workspace), holes)
+
+
+def _row(name: str, moment: Moment, frame: Frame, made: dict[str, NDArray], measures: Measures) -> Row:
+    offset = frame.camera.position - [*frame.workspace.center, 0.0]
+    distance = float(np.linalg.norm(offset))
+    elevation, azimuth = np.rad2deg([np.arcsin(offset[2] / distance), np.arctan2(offset[1], offset[0])])
+    facts = [
+        f"{name} at {elevation:.0f}° elevation, {azimuth:.0f}° azimuth, {distance:.2f} m",
+        f"sees {measures.visible:.0%} of the workspace at {measures.resolution:.2f} px/mm or more",
+        *(f"{share:.0%} of {view} inferred" for view, share in measures.holes.items()),
+    ]
+    outlined = {f"{name} and workspace": with_outline(frame.rgb, frame.camera, frame.workspace)}
+    others = {key: image for key, image in moment.stored.items() if key != name and not key.endswith("_depth")}
+    return Row(moment.title, facts, outlined | {key: _shown(image) for key, image in (others | made).items()})
+
+
+def _warnings(
+    config: PreviewConfig, views: dict[str, View], workspace: Workspace, measured: list[Measures]
+) -> list[str]:
+    """Say what is too little at some moment."""
+    warnings = []
+    visible, resolution = (min(getattr(one, name) for one in measured) for name in ("visible", "resolution"))
+    if visible < MINIMUM_VISIBLE:
+        warnings.append(
+            f"{config.camera} sees {visible:.0%} of the workspace, less than {MINIMUM_VISIBLE:.0%}: move or turn it"
+        )
+    for name in measured[0].holes:
+        holes = max(one.holes[name] for one in measured)
+        if holes > config.max_holes:
+            warnings.append(
+                f"{holes:.0%} of {name} is inferred, more than --max_holes={config.max_holes:g}: "
+                "raise the view's source_scale or lower --size"
+            )
+    for name, view in views.items():
+        asked = view.size * MILLIMETRE / workspace.size
+        if resolution < asked:
+            warnings.append(
+                f"{name} asks for {asked:.2f} px/mm and {config.camera} gives {resolution:.2f} where it gives least: "
+                f"--size={int(resolution * workspace.size / MILLIMETRE)} would show as much, "
+                "a nearer or finer camera more"
+            )
+    return warnings
+
+
+def table_resolution(camera: Camera, workspace: Workspace) -> float:
+    """Return how many of the camera's pixels a millimetre of the table spans, where and along what it spans the least.
+
+    Zero if a part of the table lies behind the camera.
+    """
+    steps = np.linspace(0.5 / LATTICE, 1 - 0.5 / LATTICE, LATTICE) * workspace.size - workspace.size / 2
+    x, y = np.meshgrid(steps + workspace.center[0], steps + workspace.center[1])
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    here, depth = project(points, camera)
+    if (depth <= 0).any():
+        return 0.0
+    moved = [project(points + step, camera)[0] - here for step in np.eye(3)[:2] * MILLIMETRE]
+    return float(np.linalg.svd(np.stack(moved, axis=-1), compute_uv=False)[:, -1].min())
+
+
+def _shown(image: NDArray) -> NDArray[np.uint8]:
+    return image if image.ndim == 3 else grey(image)
 
 
 def main() -> None:
     """Run the console command."""
-    run_command(PreviewConfig, preview, EXAMPLES)
+    run_command(PreviewConfig, preview, EXAMPLES, short={"--root": "--dataset.root"})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import platform
@@ -13,18 +12,23 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jinja2
-import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from symview_eval.preview import TITLES, frame_images
+from lerobot_symview.source_dataset import SourceDataset
+from symview_eval.contact_sheet import data_uri, png_uri
+from symview_eval.preview import read_moment
 from symview_eval.stages import Stage
 from symview_eval.statistics import SuccessRate
 
 LOSS_LINE = re.compile(r"step:\S+ .*?loss:(\S+)")
 LOG_INTERVAL = re.compile(r"'log_freq': (\d+)")
 MOMENT = 2  # frame of the first demonstration that is shown: the gripper is on its way, the arm in the picture
-SHOWN = ("side", "side_reproj", "side_persp", "top")
+SHOWN = {
+    "side": "side camera",
+    "side_reproj": "reprojected (RGBD)",
+    "side_persp": "perspective (RGB)",
+    "top": "oracle from above",
+}
 PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "numpy")
 
 
@@ -53,15 +57,17 @@ def read_success(evaluation: Path) -> SuccessRate:
 def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float]) -> None:
     """Write the page `report` from what the stages left in its folder."""
     recorded, views, _, evaluation = (stage.result for stage in stages)
-    images = frame_images(recorded, MOMENT) | frame_images(views, MOMENT)
+    images: dict[str, NDArray] = {}
+    for folder in (recorded, views):
+        images |= read_moment(SourceDataset(folder), None, 0, MOMENT).stored
     videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
     ).get_template("demo.html")
     page = template.render(
         success=read_success(evaluation),
-        moment=[(TITLES[name], _png(images[name])) for name in SHOWN],
-        videos=[_data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
+        moment=[(title, png_uri(images[name])) for name, title in SHOWN.items()],
+        videos=[data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
         chart=_loss_chart(read_losses(next((report.parent / "logs").glob("*-training.log")))),
         stages=[(stage, seconds[stage.name]) for stage in stages],
         total=sum(seconds.values()),
@@ -83,14 +89,4 @@ def _loss_chart(points: Sequence[LossPoint]) -> str:
     axes.grid(alpha=0.3)
     stream = io.BytesIO()
     figure.savefig(stream, format="svg")
-    return _data_uri("image/svg+xml", stream.getvalue())
-
-
-def _png(image: NDArray[np.uint8]) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(image).save(stream, format="PNG")
-    return _data_uri("image/png", stream.getvalue())
-
-
-def _data_uri(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+    return data_uri("image/svg+xml", stream.getvalue())

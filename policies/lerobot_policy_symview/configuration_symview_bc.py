@@ -60,6 +60,8 @@ class SymviewBcConfig(PreTrainedConfig):
     """Options of the view; filled in from the dataset where that has the view."""
     workspace: dict[str, Any] = field(default_factory=lambda: asdict(Workspace()))
     """Constructor arguments of `Workspace`; filled in from the dataset."""
+    calibration: dict[str, Any] = field(default_factory=dict)
+    """Content of the calibration file, for observations without calibration; filled in from the dataset."""
 
     # The policy scales actions itself, in a way that commutes with the group; per-axis statistics would not.
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -128,6 +130,7 @@ class SymviewBcConfig(PreTrainedConfig):
         if self.is_computed and "symview" in made:
             self.view_options = dict(made["symview"]["options"])
             self.workspace = dict(made["symview"]["workspace"])
+            self.calibration = dict(made["symview"].get("calibration", self.calibration))
         else:
             raw = features.get(self.raw_keys[0], {}).get("info") or {}
             self.workspace = dict(raw.get("symview", {}).get("workspace", self.workspace))

@@ -25,7 +25,9 @@ def make_symview_bc_pre_post_processors(
             steps.rename_observations,
             steps.add_batch_dim,
             steps.to_device,
-            ViewsProcessorStep(views=views, camera=config.camera, workspace=config.workspace),
+            ViewsProcessorStep(
+                views=views, camera=config.camera, workspace=config.workspace, calibration=config.calibration
+            ),
             steps.normalize,
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],

@@ -35,12 +35,12 @@ def metres(depth: Tensor) -> Tensor:
 class ViewsProcessorStep(ObservationProcessorStep):
     """Adds views of one camera to an observation; does nothing for a view that is already there.
 
-    For an observation without its camera's calibration, such as a real robot's, `calibration` states it.
+    An observation without its camera's calibration, such as a real robot's, is taken to have the stated one.
 
     Args:
         views: name -> options of every view wanted, as for `lerobot_symview.views.make_view`.
         camera: the camera they are made from.
-        workspace: constructor arguments of `Workspace`.
+        workspace: constructor arguments of `Workspace`; by default the calibration's, or the default one.
         calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
         gripper: which entries of `observation.state` are the gripper's x, y, z, yaw and aperture.
     """
@@ -53,8 +53,9 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
     def __post_init__(self) -> None:
         self._views = {name: make_view(name, **options) for name, options in self.views.items()}
-        self._workspace = parse_workspace(self.workspace)
-        self._stated = parse_calibration(self.calibration).camera(self.camera) if self.calibration else None
+        stated = parse_calibration(self.calibration) if self.calibration else None
+        self._stated = stated.camera(self.camera) if stated else None
+        self._workspace = (stated and not self.workspace and stated.workspace) or parse_workspace(self.workspace)
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with each missing view, as float32 (B, C, size, size) like any other image."""
@@ -94,8 +95,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
         needed = [keys.rgb(self.camera)]
         needed += [keys.depth(self.camera)] if needs_depth else []
         needed += [keys.STATE] if needs_gripper else []
-        if self._stated is None:
-            needed += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        matrices = [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        needed += matrices if self._stated is None or all(key in observation for key in matrices) else []
         missing = [key for key in needed if key not in observation]
         if missing:
             raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
@@ -109,10 +110,11 @@ class ViewsProcessorStep(ObservationProcessorStep):
         ]
 
     def _camera(self, arrays: dict[str, Tensor], index: int, height: int, width: int) -> Camera:
-        if self._stated is None:
+        if keys.intrinsics(self.camera) in arrays:
             intrinsics = arrays[keys.intrinsics(self.camera)][index].numpy()
             world_from_cam = arrays[keys.world_from_cam(self.camera)][index].numpy()
             return stored_camera(intrinsics, world_from_cam, height, width)
+        assert self._stated is not None
         if (height, width) != (self._stated.height, self._stated.width):
             raise CalibrationError(
                 f"camera {self.camera!r} is calibrated for {self._stated.height} x {self._stated.width} pixels, "

@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -6,6 +8,7 @@ from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres
 from lerobot_symview import keys
+from lerobot_symview.camera import CalibrationError
 from lerobot_symview.views import VIEWS, make_view
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
@@ -71,3 +74,37 @@ def test_metres_recognises_millimetres():
     depth = torch.tensor([0.0, 0.8, 1.2])
     torch.testing.assert_close(metres(depth), depth)
     torch.testing.assert_close(metres(depth * 1000), depth)
+
+
+def without_calibration(observed):
+    return {key: value for key, value in observed.items() if not key.startswith("observation.camera.")}
+
+
+def stated(observed):
+    matrices = {"intrinsics": (keys.intrinsics, 3), "world_from_cam": (keys.world_from_cam, 4)}
+    side = {name: observed[key("side")][0].reshape(n, n).tolist() for name, (key, n) in matrices.items()}
+    return {"units": "m", "cameras": {"side": {"height": 152, "width": 152, **side}}}
+
+
+def test_a_stated_calibration_serves_observations_without_one(observed):
+    own = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
+    step = ViewsProcessorStep(views=OPTIONS, calibration=json.loads(json.dumps(stated(observed))))
+    for key, image in ViewsProcessorStep(**step.get_config()).observation(without_calibration(observed)).items():
+        assert torch.equal(image, own[key]), key
+
+
+def test_an_observations_own_calibration_comes_first(observed):
+    wrong = stated(observed)
+    wrong["cameras"]["side"]["intrinsics"][0][0] *= 2
+    own = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
+    step = ViewsProcessorStep(views=OPTIONS, calibration=wrong)
+    key = keys.view("side", "persp")
+    assert torch.equal(step.observation(dict(observed))[key], own[key])
+    assert not torch.equal(step.observation(without_calibration(observed))[key], own[key])
+
+
+def test_images_of_another_size_than_calibrated_are_refused(observed):
+    step = ViewsProcessorStep(views={"persp": {}}, calibration=stated(observed))
+    small = {key: value[..., ::2, ::2] if "images" in key else value for key, value in observed.items()}
+    with pytest.raises(CalibrationError, match="calibrated for 152 x 152 pixels, the observation has 76 x 76"):
+        step.observation(without_calibration(small))

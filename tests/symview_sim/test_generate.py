@@ -233,7 +233,10 @@ def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monk
 def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
     from lerobot_symview.executors import ProcessExecutor
 
-    with ProcessExecutor(1) as executor, pytest.raises(CommandError, match="worker process died"):
+    with (
+        ProcessExecutor(1, "symview_sim.recording") as executor,
+        pytest.raises(CommandError, match="worker process died"),
+    ):
         list(executor.run(os._exit, [1]))
 
 

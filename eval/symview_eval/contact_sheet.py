@@ -1,0 +1,100 @@
+"""Contact sheets: labelled images in rows, as a PNG and as an HTML page that stands alone."""
+
+from __future__ import annotations
+
+import base64
+import io
+from dataclasses import dataclass, field
+
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from lerobot_symview.camera import Camera, project
+from lerobot_symview.workspace import Workspace
+
+TILE, GAP, LABEL = 228, 8, 24  # pixels
+OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)
+BORDER_POINTS = 32  # per side of the workspace: near a camera the image of a straight line still bends at the edges
+
+
+@dataclass(frozen=True)
+class Row:
+    """One moment."""
+
+    title: str
+    """What it is."""
+    facts: list[str]
+    """What was measured."""
+    images: dict[str, NDArray[np.uint8]] = field(repr=False)
+    """(H, W, 3) each, by name."""
+
+
+def montage(rows: list[Row]) -> Image.Image:
+    """Return one picture with the images of every row beside each other, enlarged and labelled."""
+    columns = max(len(row.images) for row in rows)
+    row_height = TILE + 2 * LABEL + 2 * GAP
+    sheet = Image.new("RGB", (columns * (TILE + GAP) + GAP, len(rows) * row_height), "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(14)
+    for index, row in enumerate(rows):
+        top = index * row_height
+        draw.text((GAP, top + GAP // 2), " · ".join([row.title, *row.facts]), fill="black", font=font)
+        for column, (name, image) in enumerate(row.images.items()):
+            left = GAP + column * (TILE + GAP)
+            draw.text((left, top + LABEL), name, fill=(90, 90, 90), font=font)
+            sheet.paste(_tile(image), (left, top + 2 * LABEL))
+    return sheet
+
+
+def page(title: str, rows: list[Row], warnings: list[str]) -> str:
+    """Return the same as an HTML page, with images at their own size, enlarged by the browser."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    shown = [(row, [(name, png_uri(image)) for name, image in row.images.items()]) for row in rows]
+    return environment.get_template("preview.html").render(title=title, rows=shown, warnings=warnings, tile=TILE)
+
+
+def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -> NDArray[np.uint8]:
+    """Draw the workspace's border on the table (red) and at its height limit (yellow) into a camera's image."""
+    scale = max(1, round(2 * TILE / rgb.shape[0]))
+    picture = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
+    draw = ImageDraw.Draw(picture)
+    for height, color in ((workspace.height_limit, CEILING), (0.0, OUTLINE)):
+        corners = workspace.corners(height)
+        share = np.linspace(0, 1, BORDER_POINTS)[:, None]
+        border = np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
+        pixels, depth = project(border, camera)
+        points = [tuple(point) for point in (pixels + 0.5) * scale]
+        for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
+            if near > 0 and far > 0:
+                draw.line([first, second], fill=color, width=max(2, scale))
+    return np.asarray(picture)
+
+
+def grey(metres: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Show (H, W) metres as (H, W, 3) uint8 from black, the least, to white."""
+    low, high = float(metres.min()), float(metres.max())
+    levels = np.rint(255 * (metres - low) / max(high - low, 1e-6)).astype(np.uint8)
+    return np.repeat(levels[..., None], 3, axis=-1)
+
+
+def png_uri(image: NDArray[np.uint8]) -> str:
+    """Return an image as the data URI of a PNG."""
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="PNG")
+    return data_uri("image/png", stream.getvalue())
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """Return content of a MIME type as a URI that holds it."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _tile(image: NDArray[np.uint8]) -> Image.Image:
+    height, width = image.shape[:2]
+    scale = TILE / max(height, width)
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    resampling = Image.Resampling.NEAREST if scale >= 1 else Image.Resampling.BOX
+    return Image.fromarray(image).resize(size, resampling)

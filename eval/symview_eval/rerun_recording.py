@@ -1,0 +1,69 @@
+"""A rerun recording of moments: camera frusta, point clouds, the workspace and the views (extra `viz`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_symview.camera import depth_in_metres, unproject
+from lerobot_symview.cli import CommandError
+from lerobot_symview.views import Frame
+from lerobot_symview.workspace import Workspace
+
+FRUSTUM = 0.1  # metres, where a camera's image is drawn
+POINT_RADIUS = 0.002  # metres
+
+
+class RerunRecording:
+    """Writes moments to a file that `rerun FILE` opens.
+
+    Args:
+        file: the file, ending in `.rrd`.
+        workspace: outlined on the table.
+
+    Raises:
+        CommandError: if rerun is not installed.
+    """
+
+    def __init__(self, file: Path, workspace: Workspace):
+        try:
+            import rerun
+        except ImportError:
+            raise CommandError(
+                "--rerun=true needs rerun: install the extra with `pip install 'lerobot_policy_symview[viz]'`"
+            ) from None
+        self._rerun: Any = rerun
+        self._stream: Any = rerun.RecordingStream("symview-preview")
+        self._stream.save(file)
+        self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        borders = [
+            np.vstack([corners, corners[:1]]) for corners in map(workspace.corners, (0.0, workspace.height_limit))
+        ]
+        self._stream.log("world/workspace", rerun.LineStrips3D(borders), static=True)
+
+    def add(self, moment: int, camera: str, frame: Frame, images: dict[str, NDArray]) -> None:
+        """Add what `camera` sees at one moment, and the images made from it: colour (H, W, 3) or metres (H, W)."""
+        rerun, log = self._rerun, self._stream.log
+        self._stream.set_time("frame", sequence=moment)
+        pose = frame.camera.world_from_cam
+        log(f"world/{camera}", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        pinhole = rerun.Pinhole(
+            image_from_camera=frame.camera.intrinsics,
+            resolution=[frame.camera.width, frame.camera.height],
+            image_plane_distance=FRUSTUM,
+        )
+        log(f"world/{camera}/image", pinhole, rerun.Image(frame.rgb))
+        if frame.depth is not None:
+            depth = depth_in_metres(frame.depth)
+            seen = np.isfinite(depth) & (depth > 0)
+            points = unproject(np.where(seen, depth, 0.0), frame.camera)[seen]
+            log("world/points", rerun.Points3D(points, colors=frame.rgb[seen], radii=POINT_RADIUS))
+        for name, image in images.items():
+            log(f"views/{name}", rerun.Image(image) if image.ndim == 3 else rerun.DepthImage(image, meter=1.0))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._stream.disconnect()

@@ -1,0 +1,179 @@
+"""What views cost: as ratios to OpenCV's warp of the same image in the same run, and offline, end to end."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+
+from lerobot_symview import derivation
+from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.perspective import image_from_topdown
+from lerobot_symview.source_dataset import SourceDataset
+from lerobot_symview.views import Frame, make_view
+from symview_eval.clock import Clock
+from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+from symview_sim.settings import EnvSettings
+
+RECORDED = 25  # episodes that the offline dataset repeats
+VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
+    "reproject_nearest": ("reproj", {}),
+    "reproject_none": ("reproj", {"infill": "none"}),
+    "reproject_local": ("reproj", {"infill": "local"}),
+    "reproject_scale_2": ("reproj", {"source_scale": 2}),
+    "perspective": ("persp", {"gripper": False}),
+    "perspective_with_gripper": ("persp", {}),
+}
+CODECS = (
+    (SourceDataset, "decode"),
+    (derivation, "encode_rgb"),
+    (derivation, "encode_metres"),
+    (pq.ParquetFile, "read_row_groups"),
+    (pq.ParquetWriter, "write_table"),
+)
+
+
+@dataclass(frozen=True)
+class ViewsBenchmark:
+    """Cost of views at 152 x 152 on one core, and of `symview-add-views`."""
+
+    repeats: int = 300
+    """How often each view is made; each time is followed by one of OpenCV's warp, whose ratio counts."""
+    frames: int = 20_000
+    """Frames of the dataset to which views are added; 0 leaves that out. A second process takes seconds to start."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        if self.repeats < 1:
+            raise ValueError(f"--repeats must be at least 1, got {self.repeats}")
+        if self.frames < 0:
+            raise ValueError(f"--frames must not be negative, got {self.frames}")
+
+
+def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
+    """Return medians, quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
+
+    `floor_ratio` is what copying the bytes takes that a reprojection must read and write. `offline_codec_share` is the
+    part of `symview-add-views` spent in reading, writing, decoding and encoding, `offline_two_process_speedup` what a
+    second process gains, start-up included, `frames_per_s` what one process makes of both views.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        results = _ratios(_frame(), config.repeats)
+    finally:
+        cv2.setNumThreads(threads)
+    return results | (_offline(config.frames) if config.frames else {})
+
+
+def _frame() -> Frame:
+    env = EnvSettings().make()
+    observation, _ = env.reset(seed=0)
+    camera = env.cameras["side"]
+    rgb, depth = observation["pixels"]["side"], observation["images.side_depth"][0]
+    frame = Frame(rgb, depth, camera, env.workspace, observation["agent_pos"])
+    env.close()
+    return frame
+
+
+def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
+    assert frame.depth is not None
+    size = make_view("persp").size
+    homography = image_from_topdown(frame.camera, frame.workspace, size)
+
+    def warp() -> None:
+        cv2.warpPerspective(frame.rgb, homography, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+    moved = np.empty(frame.rgb.nbytes + frame.depth.nbytes + size * size * 7, dtype=np.uint8)
+    target = np.empty_like(moved)
+    candidates: dict[str, Callable[[], object]] = {"floor": lambda: np.copyto(target, moved)}
+    for name, (view_name, options) in VIEWS.items():
+        view = make_view(view_name, **options)
+        candidates[name] = lambda view=view: view.render(frame)  # type: ignore[misc]
+    warps: list[float] = []
+    results: dict[str, float] = {}
+    for name, candidate in candidates.items():
+        candidate()
+        warp()
+        ratios = []
+        for _ in range(repeats):
+            seconds, reference = _seconds(candidate), _seconds(warp)
+            warps.append(reference)
+            ratios.append(seconds / reference)
+        low, median, high = statistics.quantiles(ratios, n=4) if repeats > 1 else ratios * 3
+        results |= {f"{name}_ratio": median, f"{name}_ratio_low": low, f"{name}_ratio_high": high}
+    return {"warp_us": 1e6 * statistics.median(warps)} | results
+
+
+def _offline(frames: int) -> dict[str, float]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recorded, source = _repeated_dataset(folder, frames)
+
+        def add(dataset: Path, target: str, num_workers: int = 1) -> float:
+            config = AddViewsConfig(
+                DatasetTarget("benchmark/source", dataset),
+                new_root=folder / target,
+                views=["reproj", "persp"],
+                num_workers=num_workers,
+            )
+            return _seconds(lambda: add_views(config))
+
+        add(recorded, "first")  # imports and compiled kernels are loaded before the clocks start
+        with _codec_clocks() as clocks:
+            alone = add(source, "single")
+        shutil.rmtree(folder / "single")
+        together = add(source, "double", num_workers=2)
+        total = SourceDataset(source).info["total_frames"]
+    return {
+        "offline_codec_share": sum(clock.milliseconds for clock in clocks) / 1000 / alone,
+        "offline_two_process_speedup": alone / together,
+        "frames_per_s": total / alone,
+    }
+
+
+def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
+    """Return a recorded dataset, and one that repeats it to at least `frames` frames."""
+    from lerobot.datasets import aggregate_datasets
+
+    target = RecordedDataset("benchmark/recorded", folder / "recorded")
+    recorded = generate(GenerateConfig(target, env=RecordedEnv(oracle=False), num_episodes=RECORDED))
+    repeats = -(-frames // SourceDataset(recorded).info["total_frames"])
+    if repeats == 1:
+        return recorded, recorded
+    aggregate_datasets(
+        [target.repo_id] * repeats,
+        "benchmark/source",
+        roots=[recorded] * repeats,
+        aggr_root=folder / "source",
+        concatenate_data=False,
+    )
+    return recorded, folder / "source"
+
+
+@contextmanager
+def _codec_clocks() -> Iterator[list[Clock]]:
+    clocks = [Clock(owner, name) for owner, name in CODECS]
+    try:
+        yield clocks
+    finally:
+        for clock in clocks:
+            clock.remove()
+
+
+def _seconds(call: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    call()
+    return time.perf_counter() - start
