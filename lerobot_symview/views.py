@@ -168,7 +168,7 @@ class ReprojectedView:
         if self.source_scale > 1:
             depth, camera = enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
             rgb = rgb.repeat(self.source_scale, axis=0).repeat(self.source_scale, axis=1)
-        buffer = zbuffer_from_depth([depth], [camera], frame.workspace, self.size, self._ceiling(frame))
+        buffer = zbuffer_from_depth([depth], [camera], frame.workspace, self.size, self.ceiling(_height(frame)))
         seen = buffer.source != EMPTY
         shown = nearest_known(seen) if self.infill == "nearest" else _every_cell(self.size)
         colors, height = gather(shown, buffer, rgb.reshape(-1, 3))
@@ -179,11 +179,14 @@ class ReprojectedView:
             images["reproj_seen"] = _three_channels(seen.astype(np.uint8) * np.uint8(255))
         return {output: images[output] for output in self.outputs}
 
-    def _ceiling(self, frame: Frame) -> float:
+    def ceiling(self, gripper_height: float | None) -> float:
+        """Return the height above which points are left out, metres, for a gripper at `gripper_height`."""
         if self.clip == "none":
             return np.inf
         if self.clip == "gripper":
-            return max(_gripper_height(frame, "clip") - self.clip_margin, self.clip_floor)
+            if gripper_height is None:
+                raise ValueError("clip=gripper needs the gripper's state; without it, clip=none or a height in metres")
+            return max(gripper_height - self.clip_margin, self.clip_floor)
         return float(self.clip)
 
 
@@ -222,10 +225,18 @@ class PerspectiveView:
         if isinstance(self.plane_height, str) and self.plane_height != "gripper":
             raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
+    def plane(self, gripper_height: float | None) -> float:
+        """Return the height of the plane that is mapped exactly, metres, for a gripper at `gripper_height`."""
+        if self.plane_height != "gripper":
+            return float(self.plane_height)
+        if gripper_height is None:
+            raise ValueError("plane_height=gripper needs the gripper's state; without it, state a height in metres")
+        return gripper_height
+
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the warped image and the gripper image (grey, brightness = height)."""
-        height = _gripper_height(frame, "plane_height") if self.plane_height == "gripper" else float(self.plane_height)
-        images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, height))}
+        plane_height = self.plane(_height(frame))
+        images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, plane_height))}
         if self.gripper:
             if frame.gripper is None:
                 raise ValueError("the gripper image needs the gripper's state; without it, gripper=false")
@@ -247,10 +258,8 @@ def _every_cell(pixels: int) -> NDArray[np.int32]:
     return np.arange(pixels**2, dtype=np.int32).reshape(pixels, pixels)
 
 
-def _gripper_height(frame: Frame, option: str) -> float:
-    if frame.gripper is None:
-        raise ValueError(f"{option}=gripper needs the gripper's state; without it, state a height in metres")
-    return float(frame.gripper[2])
+def _height(frame: Frame) -> float | None:
+    return None if frame.gripper is None else float(frame.gripper[2])
 
 
 def _check_size(size: int) -> None:

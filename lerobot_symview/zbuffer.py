@@ -78,7 +78,7 @@ def zbuffer_from_depth(
     for depth, camera in zip(depths, cameras, strict=True):
         if depth.shape != (camera.height, camera.width):
             raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-        _draw_depth(depth, *_grid_from_pixel(camera, workspace, pixels), ceiling, first, *buffer)
+        _draw_depth(depth, *grid_from_pixel(camera, workspace, pixels), ceiling, first, *buffer)
         first += depth.size
     return buffer
 
@@ -107,8 +107,11 @@ def _cleared(pixels: int) -> ZBuffer:
 
 
 @lru_cache(maxsize=256)
-def _grid_from_pixel(camera: Camera, workspace: Workspace, pixels: int) -> tuple[Array, Array]:
-    """Matrix A (3, 3) and offset b (3,): pixel (u, v) at depth d lies at d A (u, v, 1) + b in (row, column, height)."""
+def grid_from_pixel(camera: Camera, workspace: Workspace, pixels: int) -> tuple[Array, Array]:
+    """Return A (3, 3) and b (3,): pixel (u, v) at depth d lies at d A (u, v, 1) + b in (row, column, height).
+
+    Rows and columns count from the grid's edge, in cells; heights are metres.
+    """
     scale = np.array([pixels / workspace.size, pixels / workspace.size, 1.0])
     rays = camera.world_from_cam[:3, :3] @ np.linalg.inv(camera.intrinsics)
     origin = camera.position - np.array([*workspace.center, 0.0])

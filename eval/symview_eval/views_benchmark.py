@@ -9,15 +9,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
+import torch
 
 from lerobot_symview import derivation
 from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.batched import FrameBatch, render_batch
 from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.perspective import image_from_topdown
 from lerobot_symview.source_dataset import SourceDataset
@@ -26,6 +29,7 @@ from symview_eval.clock import Clock
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from symview_sim.settings import EnvSettings
 
+BATCH = 64  # frames on a GPU
 RECORDED = 25  # episodes that the offline dataset repeats
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
@@ -65,9 +69,10 @@ class ViewsBenchmark:
 def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
     """Return medians, quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
 
-    `floor_ratio` is what copying the bytes takes that a reprojection must read and write. `offline_codec_share` is the
-    part of `symview-add-views` spent in reading, writing, decoding and encoding, `offline_two_process_speedup` what a
-    second process gains, start-up included, `frames_per_s` what one process makes of both views.
+    `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
+    costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
+    decoding, encoding and writing, `offline_two_process_speedup` what a second process gains, start-up included,
+    `frames_per_s` what one process makes of both views.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -75,7 +80,50 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
         results = _ratios(_frame(), config.repeats)
     finally:
         cv2.setNumThreads(threads)
+    if torch.cuda.is_available():
+        results |= batched_ratios(_frame(), config.repeats, "cuda")
     return results | (_offline(config.frames) if config.frames else {})
+
+
+def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
+    """Return what a frame of a batch of 64 costs on `device`, and that over copying there what it reads and writes."""
+    assert frame.depth is not None
+    rgb = torch.from_numpy(frame.rgb.copy()).permute(2, 0, 1)[None].expand(BATCH, -1, -1, -1).contiguous()
+    depth = torch.from_numpy(frame.depth.copy())[None].expand(BATCH, -1, -1).contiguous()
+    gripper = torch.as_tensor(frame.gripper)[None].expand(BATCH, -1)
+    cameras = [frame.camera] * BATCH
+    batch = FrameBatch(rgb.to(device), depth.to(device), cameras, frame.workspace, gripper.to(device))
+    moved = torch.empty(BATCH * _moved_bytes(frame), dtype=torch.uint8, device=device)
+    target = torch.empty_like(moved)
+
+    def seconds(call: Callable[[], object]) -> float:
+        _synchronize(device)
+        start = time.perf_counter()
+        call()
+        _synchronize(device)
+        return time.perf_counter() - start
+
+    results = {}
+    for name in ("reproject_nearest", "reproject_none", "perspective"):
+        view_name, options = VIEWS[name]
+        view = make_view(view_name, **options)
+        render = partial(render_batch, view, batch)
+        render()
+        times = [(seconds(render), seconds(lambda: target.copy_(moved))) for _ in range(repeats)]
+        results[f"batched_{name}_us"] = 1e6 * statistics.median(one for one, _ in times) / BATCH
+        results[f"batched_{name}_copy_ratio"] = statistics.median(one / copy for one, copy in times)
+    return results
+
+
+def _synchronize(device: str) -> None:
+    if device == "cuda":
+        torch.cuda.synchronize()
+
+
+def _moved_bytes(frame: Frame) -> int:
+    """Return how many bytes a reprojection must read and write."""
+    assert frame.depth is not None
+    return frame.rgb.nbytes + frame.depth.nbytes + make_view("reproj").size ** 2 * 7  # colour and float height
 
 
 def _frame() -> Frame:
@@ -96,7 +144,7 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
     def warp() -> None:
         cv2.warpPerspective(frame.rgb, homography, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
-    moved = np.empty(frame.rgb.nbytes + frame.depth.nbytes + size * size * 7, dtype=np.uint8)
+    moved = np.empty(_moved_bytes(frame), dtype=np.uint8)
     target = np.empty_like(moved)
     candidates: dict[str, Callable[[], object]] = {"floor": lambda: np.copyto(target, moved)}
     for name, (view_name, options) in VIEWS.items():

@@ -13,9 +13,10 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_symview import keys
+from lerobot_symview.batched import FrameBatch, can_batch, render_batch
 from lerobot_symview.calibration import parse_calibration, parse_workspace
 from lerobot_symview.camera import CalibrationError, Camera, stored_camera
-from lerobot_symview.views import Frame, make_view
+from lerobot_symview.views import Frame, View, make_view
 
 METRES_AT_MOST = 10.0
 
@@ -68,14 +69,11 @@ class ViewsProcessorStep(ObservationProcessorStep):
             return observation
         needs_depth = any(view.needs_depth for view in missing.values())
         needs_gripper = any(view.needs_gripper for view in missing.values())
-        frames = self._frames(observation, list(missing), needs_depth, needs_gripper)
-        device = observation[keys.rgb(self.camera)].device
+        batch = self._batch(observation, list(missing), needs_depth, needs_gripper)
         for view in missing.values():
-            images = [view.render(frame) for frame in frames]
-            for output, kind in view.outputs.items():
-                stacked = torch.from_numpy(np.stack([image[output] for image in images])).to(device)
+            for output, images in _render(view, batch).items():
                 observation[keys.view(self.camera, output)] = (
-                    stacked.permute(0, 3, 1, 2).float() / 255 if kind == "rgb" else stacked[:, None]
+                    images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
                 )
         return observation
 
@@ -89,31 +87,32 @@ class ViewsProcessorStep(ObservationProcessorStep):
         """Leave the declared features alone: the policy names what it needs."""
         return features
 
-    def _frames(
+    def _batch(
         self, observation: RobotObservation, views: list[str], needs_depth: bool, needs_gripper: bool
-    ) -> list[Frame]:
-        needed = [keys.rgb(self.camera)]
-        needed += [keys.depth(self.camera)] if needs_depth else []
-        needed += [keys.STATE] if needs_gripper else []
+    ) -> FrameBatch:
+        color, depth = keys.rgb(self.camera), keys.depth(self.camera)
+        needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if needs_gripper else [])
         matrices = [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
-        needed += matrices if self._stated is None or all(key in observation for key in matrices) else []
-        missing = [key for key in needed if key not in observation]
+        own = self._stated is None or all(key in observation for key in matrices)
+        missing = [key for key in needed + (matrices if own else []) if key not in observation]
         if missing:
             raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
-        arrays = {key: observation[key].detach().cpu() for key in needed}
-        rgb = (arrays[keys.rgb(self.camera)] * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
-        depth = metres(arrays[keys.depth(self.camera)])[:, 0].numpy() if needs_depth else [None] * len(rgb)
-        gripper = arrays[keys.STATE][:, self.gripper].numpy() if needs_gripper else [None] * len(rgb)
-        return [
-            Frame(rgb[i], depth[i], self._camera(arrays, i, *rgb.shape[1:3]), self._workspace, gripper[i])
-            for i in range(len(rgb))
-        ]
+        rgb = (observation[color].detach() * 255).round().to(torch.uint8)
+        height, width = rgb.shape[2:]
+        if own:
+            stored = (observation[key].detach().cpu().numpy() for key in matrices)
+            cameras = [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
+        else:
+            cameras = [self._stated_camera(height, width)] * len(rgb)
+        return FrameBatch(
+            rgb,
+            metres(observation[depth].detach())[:, 0] if needs_depth else None,
+            cameras,
+            self._workspace,
+            observation[keys.STATE].detach()[:, self.gripper] if needs_gripper else None,
+        )
 
-    def _camera(self, arrays: dict[str, Tensor], index: int, height: int, width: int) -> Camera:
-        if keys.intrinsics(self.camera) in arrays:
-            intrinsics = arrays[keys.intrinsics(self.camera)][index].numpy()
-            world_from_cam = arrays[keys.world_from_cam(self.camera)][index].numpy()
-            return stored_camera(intrinsics, world_from_cam, height, width)
+    def _stated_camera(self, height: int, width: int) -> Camera:
         assert self._stated is not None
         if (height, width) != (self._stated.height, self._stated.width):
             raise CalibrationError(
@@ -121,3 +120,29 @@ class ViewsProcessorStep(ObservationProcessorStep):
                 f"the observation has {height} x {width}"
             )
         return self._stated
+
+
+def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
+    """Return each output for all frames, on their device: together on a GPU, by the compiled kernels elsewhere."""
+    device = batch.rgb.device
+    if device.type != "cpu" and can_batch(view):
+        return render_batch(view, batch)
+    rgb = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu().numpy()
+    depth, gripper = (None if one is None else one.cpu().numpy() for one in (batch.depth, batch.gripper))
+    images = [
+        view.render(
+            Frame(
+                rgb[i],
+                None if depth is None else depth[i],
+                camera,
+                batch.workspace,
+                None if gripper is None else gripper[i],
+            )
+        )
+        for i, camera in enumerate(batch.cameras)
+    ]
+    stacked = {output: torch.from_numpy(np.stack([image[output] for image in images])) for output in view.outputs}
+    channels_first = {
+        output: image.permute(0, 3, 1, 2) if image.ndim == 4 else image for output, image in stacked.items()
+    }
+    return {output: image.to(device) for output, image in channels_first.items()}

@@ -1,0 +1,90 @@
+"""The same bits as the compiled kernels; on a GPU too, where there is one."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_symview.batched import FrameBatch, can_batch, nearest_known_batch, render_batch
+from lerobot_symview.infill import nearest_known
+from lerobot_symview.views import Frame, make_view
+from lerobot_symview.workspace import Workspace
+from tests.lerobot_symview.cameras import SHAPE, cameras
+from tests.lerobot_symview.test_infill import MASKS
+from tests.lerobot_symview.test_zbuffer import random_depth
+
+SIZE = 24
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+OPTIONS = [
+    ("reproj", {"infill": "nearest", "mask": True}),
+    ("reproj", {"infill": "none", "clip": "none"}),
+    ("reproj", {"infill": "none", "clip": 0.05, "height": False}),
+    ("persp", {}),
+    ("persp", {"plane_height": "gripper", "gripper": False}),
+]
+
+
+def frames_of(views, seed):
+    """Two frames; heights come in steps, so that many are equal."""
+    rng = np.random.default_rng(seed)
+    for camera in views:
+        depth = random_depth(int(rng.integers(2**31))).astype(np.float32)
+        depth[::2] = np.round(depth[::2], 1)
+        gripper = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.0, 0.1), rng.uniform(-2, 2), rng.random()])
+        rgb = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+        yield Frame(rgb, depth, camera, Workspace(), gripper.astype(np.float32))
+
+
+def batch_of(frames, device):
+    return FrameBatch(
+        torch.from_numpy(np.stack([frame.rgb for frame in frames])).permute(0, 3, 1, 2).contiguous().to(device),
+        torch.from_numpy(np.stack([frame.depth for frame in frames])).to(device),
+        [frame.camera for frame in frames],
+        frames[0].workspace,
+        torch.from_numpy(np.stack([frame.gripper for frame in frames])).to(device),
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("name", "options"), OPTIONS)
+@given(views=st.lists(cameras(), min_size=2, max_size=2), seed=st.integers(0, 2**32 - 1))
+def test_a_batch_has_the_bits_of_its_frames(name, options, device, views, seed):
+    view, frames = make_view(name, size=SIZE, **options), list(frames_of(views, seed))
+    try:
+        expected = [view.render(frame) for frame in frames]
+    except ValueError:  # the camera lies behind or in the plane: the same is said of the batch
+        with pytest.raises(ValueError, match=r"workspace|plane"):
+            render_batch(view, batch_of(frames, device))
+        return
+    images = render_batch(view, batch_of(frames, device))
+    assert list(images) == list(view.outputs)
+    for output, stacked in images.items():
+        for one, image in zip(expected, stacked.cpu().numpy(), strict=True):
+            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, one[output])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@given(known=MASKS.filter(np.any))
+def test_nearest_pixels_are_those_found_one_by_one(device, known):
+    batch = torch.from_numpy(np.stack([known, np.zeros_like(known)])).to(device)
+    found = nearest_known_batch(batch).cpu().numpy()
+    np.testing.assert_array_equal(found[0], nearest_known(known))
+    assert not found[1].any()
+
+
+@pytest.mark.parametrize("options", [{"infill": "local"}, {"source_scale": 2}])
+def test_what_is_not_batched_says_so(options):
+    view = make_view("reproj", **options)
+    assert not can_batch(view)
+    batch = FrameBatch(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), None, [], Workspace())
+    with pytest.raises(ValueError, match="frame by frame"):
+        render_batch(view, batch)
+
+
+def test_missing_inputs_are_named():
+    batch = FrameBatch(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), None, [], Workspace())
+    with pytest.raises(ValueError, match="needs depth"):
+        render_batch(make_view("reproj"), batch)
+    with pytest.raises(ValueError, match="gripper"):
+        render_batch(make_view("persp"), batch)
