@@ -200,7 +200,7 @@ class FrameReader:
             return
         cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
         remedy = f"--camera={self.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
-        if self.gripper:
+        if any(keys.STATE in one for one in missing):
             remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
         raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
 

@@ -15,13 +15,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 
-from lerobot_symview import derivation
+from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.batched import FrameBatch, render_batch
 from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.perspective import image_from_topdown
 from lerobot_symview.source_dataset import SourceDataset
 from lerobot_symview.views import Frame, make_view
@@ -30,6 +32,7 @@ from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, g
 from symview_sim.settings import EnvSettings
 
 BATCH = 64  # frames on a GPU
+NOISE = 2.0  # levels of 255, standard deviation: a webcam indoors
 RECORDED = 25  # episodes that the offline dataset repeats
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
@@ -54,7 +57,7 @@ class ViewsBenchmark:
 
     repeats: int = 300
     """How often each view is made; each time is followed by one of OpenCV's warp, whose ratio counts."""
-    frames: int = 20_000
+    frames: int = 10_000
     """Frames of the dataset to which views are added; 0 leaves that out. A second process takes seconds to start."""
     json: bool = False
     """Print one JSON object instead of a table."""
@@ -71,8 +74,8 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
 
     `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
     costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
-    decoding, encoding and writing, `offline_two_process_speedup` what a second process gains, start-up included,
-    `frames_per_s` what one process makes of both views.
+    decoding, encoding and writing, for images with a real camera's noise; `offline_two_process_speedup` what a second
+    process gains, start-up included; `frames_per_s` what one process makes of both views.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -193,11 +196,13 @@ def _offline(frames: int) -> dict[str, float]:
 
 
 def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
-    """Return a recorded dataset, and one that repeats it to at least `frames` frames."""
+    """Return a recorded dataset with a real camera's noise, and one that repeats it to at least `frames` frames."""
     from lerobot.datasets import aggregate_datasets
 
     target = RecordedDataset("benchmark/recorded", folder / "recorded")
     recorded = generate(GenerateConfig(target, env=RecordedEnv(oracle=False), num_episodes=RECORDED))
+    for file in sorted((recorded / "data").rglob("*.parquet")):
+        _add_noise(file, keys.rgb("side"))
     repeats = -(-frames // SourceDataset(recorded).info["total_frames"])
     if repeats == 1:
         return recorded, recorded
@@ -209,6 +214,18 @@ def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
         concatenate_data=False,
     )
     return recorded, folder / "source"
+
+
+def _add_noise(file: Path, key: str) -> None:
+    """Make a table's colour images as hard to compress as a camera's, whose pixels are never quite alike."""
+    table, rng = pq.read_table(file), np.random.default_rng(0)
+    cells = table[key].to_pylist()
+    for cell in cells:
+        image = decode_rgb(cell["bytes"])
+        noisy = image + rng.normal(0.0, NOISE, image.shape)
+        cell["bytes"] = encode_rgb(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    column = table.schema.get_field_index(key)
+    pq.write_table(table.set_column(column, table.field(column), pa.array(cells, table.field(column).type)), file)
 
 
 @contextmanager

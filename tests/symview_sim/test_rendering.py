@@ -2,9 +2,12 @@ import numpy as np
 import pytest
 
 from lerobot_symview.camera import project, unproject
+from lerobot_symview.placement import CameraSpec
+from lerobot_symview.views import Frame, make_view
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
+from symview_sim.settings import EnvSettings
 from tests.conftest import make_camera
 
 BOX = np.array([0.30, 0.24, 0.04])
@@ -61,3 +64,21 @@ def test_hiding_the_arm_removes_it_and_brings_it_back(scene):
         without = render(scene.client, camera)[1]
     np.testing.assert_array_equal(render(scene.client, camera)[1], before)
     assert (without != before).mean() > 0.005
+
+
+@pytest.mark.parametrize("task", ["block_stacking", "block_in_bowl", "drawer_opening"])
+def test_a_camera_straight_above_reprojects_to_the_oracles_image(task):
+    """Nothing is hidden from it but what leans outwards, so the view is the oracle's image up to its edges."""
+    camera = CameraSpec(height=304, width=304, elevation_deg=90.0, distance=1.5, fov_deg=24.0, sees_robot=False)
+    env = EnvSettings(task=task, camera=camera, oracle=True).make()
+    observation, _ = env.reset(seed=3)
+    rgb, depth = observation["pixels"]["side"], observation["images.side_depth"][0]
+    frame = Frame(rgb, depth, env.cameras["side"], env.workspace)
+    images = make_view("reproj", size=304, clip="none").render(frame)
+    oracle = observation["pixels"]["top"]
+    different = np.abs(images["reproj"].astype(int) - oracle).max(axis=-1) > 24
+    assert different.mean() < 0.03
+    height = env.cameras["top"].position[2] - observation["images.top_depth"][0]
+    assert (np.abs(images["reproj_height"] - height) > 0.004).mean() < 0.03
+    assert height.max() > 0.03
+    env.close()
