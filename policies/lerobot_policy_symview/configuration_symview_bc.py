@@ -18,7 +18,7 @@ from lerobot_symview.workspace import Workspace
 
 CAMERA_IMAGES = ("side", "top")  # views that are a camera's own image: nothing is computed
 ENCODER_NAMES = ("equivariant", "plain")
-CROP_SIZES = (64, 128)
+CROP_SIZES = (64, 128)  # every pooling halves an even size, which keeps D4 exact; the last 8 px become 6, 3, 1
 
 
 @PreTrainedConfig.register_subclass("symview_bc")

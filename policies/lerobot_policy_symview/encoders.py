@@ -10,8 +10,6 @@ from torch import Tensor, nn
 from lerobot_policy_symview.escnn_import import enn, gspaces
 from lerobot_policy_symview.symmetry import ThetaRepresentation
 
-CROP_SIZES = (64, 128)  # every pooling halves an even size, which keeps D4 exact; the last 8 px become 6, 3, 1
-
 
 def stage_widths(crop_size: int, width: int) -> list[int]:
     """Widths of the convolutions that each halve the image, down to 8 px; the paper's for 128 px, one fewer for 64."""
@@ -23,7 +21,7 @@ class EquivariantEncoder(nn.Module):
 
     Args:
         channels: input channels, each a scalar field on the table.
-        crop_size: rows and columns of the input, one of `CROP_SIZES`.
+        crop_size: rows and columns of the input, one of the configuration's `CROP_SIZES`.
         width: regular fields of the widest but one layer (the paper's n).
         action_kinds: declaration of the action's entries, see `symmetry`.
         theta_representation: representation of yaw increments; `trivial` is the paper's text, `sign` is right.

@@ -7,7 +7,8 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 
-from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration_symview_bc import CROP_SIZES, ENCODER_NAMES, SymviewBcConfig
+from lerobot_policy_symview.encoders import ENCODERS, stage_widths
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_policy_symview.symmetry import mirror, turn
@@ -186,3 +187,8 @@ def test_the_paper_sized_encoders_have_the_papers_parameter_counts(encoder, chan
 def test_impossible_configurations_are_refused_by_their_flag(options, message):
     with pytest.raises(ValueError, match=message):
         SymviewBcConfig(device="cpu", **options)
+
+
+def test_the_configuration_offers_what_the_networks_have():
+    assert tuple(ENCODERS) == ENCODER_NAMES
+    assert all(stage_widths(crop_size, 64) for crop_size in CROP_SIZES)
