@@ -1,20 +1,37 @@
 """Views from above of what a freely placed camera sees: geometry and views, without simulator or network."""
 
-from lerobot_symview.camera import CalibrationError, Camera
-from lerobot_symview.placement import CameraSpec
-from lerobot_symview.views import VIEWS, Frame, PerspectiveView, ReprojectedView, View, make_view, register_view
-from lerobot_symview.workspace import Workspace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "VIEWS",
-    "CalibrationError",
-    "Camera",
-    "CameraSpec",
-    "Frame",
-    "PerspectiveView",
-    "ReprojectedView",
-    "View",
-    "Workspace",
-    "make_view",
-    "register_view",
-]
+if TYPE_CHECKING:
+    from lerobot_symview.camera import CalibrationError as CalibrationError
+    from lerobot_symview.camera import Camera as Camera
+    from lerobot_symview.placement import CameraSpec as CameraSpec
+    from lerobot_symview.views import VIEWS as VIEWS
+    from lerobot_symview.views import Frame as Frame
+    from lerobot_symview.views import PerspectiveView as PerspectiveView
+    from lerobot_symview.views import ReprojectedView as ReprojectedView
+    from lerobot_symview.views import View as View
+    from lerobot_symview.views import make_view as make_view
+    from lerobot_symview.views import register_view as register_view
+    from lerobot_symview.workspace import Workspace as Workspace
+
+# Loaded when they are asked for: views need numba, which takes longer to import than a simulator does, without views.
+_HOMES = {
+    "camera": ("CalibrationError", "Camera"),
+    "placement": ("CameraSpec",),
+    "views": ("VIEWS", "Frame", "PerspectiveView", "ReprojectedView", "View", "make_view", "register_view"),
+    "workspace": ("Workspace",),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name from the module that defines it."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(_HOME)

@@ -178,13 +178,17 @@ def _render(
                 encoded[key].append(encode_rgb(image) if kinds[key] == "rgb" else encode_metres(image))
     columns: dict[str, pa.Array] = {}
     for key, images in encoded.items():
-        extension = "png" if kinds[key] == "rgb" else "tiff"
-        names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
-        columns[key] = pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
+        columns[key] = image_column(images, "png" if kinds[key] == "rgb" else "tiff")
     for key, values in _added_vectors(derivation).items():
         flat = pa.array(np.tile(values, len(table)))
         columns[key] = pa.FixedSizeListArray.from_arrays(flat, len(values))
     return columns, statistics
+
+
+def image_column(images: list[bytes], extension: str) -> pa.StructArray:
+    """Return encoded images as the column that Hugging Face's `datasets` reads, with file names like LeRobot's."""
+    names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
+    return pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
 
 
 def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:

@@ -1,6 +1,8 @@
 """Rules about the repository itself."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -37,3 +39,11 @@ def test_the_readme_shows_the_commands_the_demo_runs():
     readme = (ROOT / "README.md").read_text()
     for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval", "symview-preview"):
         assert f"\n{command} " in readme
+
+
+def test_public_names_are_there_and_simulators_start_without_numba():
+    import lerobot_symview
+
+    assert all(getattr(lerobot_symview, name) is not None for name in dir(lerobot_symview))
+    check = "import sys, symview_sim.env; sys.exit('numba' in sys.modules or 'lerobot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

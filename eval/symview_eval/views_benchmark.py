@@ -17,11 +17,9 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import torch
 
 from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.batched import FrameBatch, render_batch
 from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.perspective import image_from_topdown
@@ -46,6 +44,7 @@ CODECS = (
     (SourceDataset, "decode"),
     (derivation, "encode_rgb"),
     (derivation, "encode_metres"),
+    (derivation, "image_column"),
     (pq.ParquetFile, "read_row_groups"),
     (pq.ParquetWriter, "write_table"),
 )
@@ -83,13 +82,26 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
         results = _ratios(_frame(), config.repeats)
     finally:
         cv2.setNumThreads(threads)
-    if torch.cuda.is_available():
-        results |= batched_ratios(_frame(), config.repeats, "cuda")
+    results |= _on_a_gpu(config.repeats)
     return results | (_offline(config.frames) if config.frames else {})
+
+
+def _on_a_gpu(repeats: int) -> dict[str, float]:
+    import torch  # not above: worker processes import this module, and torch takes longer than their work
+
+    return batched_ratios(_frame(), repeats, "cuda") if torch.cuda.is_available() else {}
 
 
 def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
     """Return what a frame of a batch of 64 costs on `device`, and that over copying there what it reads and writes."""
+    import torch
+
+    from lerobot_symview.batched import FrameBatch, render_batch
+
+    def synchronize() -> None:
+        if device == "cuda":
+            torch.cuda.synchronize()
+
     assert frame.depth is not None
     rgb = torch.from_numpy(frame.rgb.copy()).permute(2, 0, 1)[None].expand(BATCH, -1, -1, -1).contiguous()
     depth = torch.from_numpy(frame.depth.copy())[None].expand(BATCH, -1, -1).contiguous()
@@ -100,10 +112,10 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
     target = torch.empty_like(moved)
 
     def seconds(call: Callable[[], object]) -> float:
-        _synchronize(device)
+        synchronize()
         start = time.perf_counter()
         call()
-        _synchronize(device)
+        synchronize()
         return time.perf_counter() - start
 
     results = {}
@@ -116,11 +128,6 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
         results[f"batched_{name}_us"] = 1e6 * statistics.median(one for one, _ in times) / BATCH
         results[f"batched_{name}_copy_ratio"] = statistics.median(one / copy for one, copy in times)
     return results
-
-
-def _synchronize(device: str) -> None:
-    if device == "cuda":
-        torch.cuda.synchronize()
 
 
 def _moved_bytes(frame: Frame) -> int:
