@@ -16,7 +16,8 @@ from lerobot.datasets import LeRobotDataset, modify_features
 
 from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.camera import CalibrationError, Camera, stored_camera
+from lerobot_symview.calibration import Calibration, parse_calibration, plain_calibration
+from lerobot_symview.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.placement import CameraSpec, CameraSpread
 from lerobot_symview.source_dataset import SourceDataset, vectors
@@ -24,6 +25,7 @@ from lerobot_symview.views import VIEWS, Frame, make_view
 from lerobot_symview.workspace import Workspace
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from tests.conftest import VIEW_SIZE, largest_file
+from tests.lerobot_symview.test_upsampling import plane_depth
 
 
 def parquet_columns(folder):
@@ -306,6 +308,55 @@ def test_a_camera_that_moves_is_followed(tmp_path):
         expected = make_view("persp", size=VIEW_SIZE).render(frame)["persp"]
         stored = (result[index][keys.view("side", "persp")] * 255).round().byte().permute(1, 2, 0).numpy()
         np.testing.assert_array_equal(stored, expected)
+
+
+@pytest.mark.parametrize("use_videos", [False, True])
+def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
+    """Joint angles, a wide image, depth in uint16 millimetres, as a RealSense gives it."""
+    camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
+    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
+    kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
+    source = LeRobotDataset.create(
+        "test/real",
+        fps=10,
+        root=tmp_path / "real",
+        use_videos=use_videos,
+        features={
+            keys.STATE: joints,
+            keys.ACTION: joints,
+            keys.rgb("front"): {"dtype": kind, "shape": (96, 128, 3), "names": axes},
+            keys.depth("front"): {
+                "dtype": "image",
+                "shape": (96, 128, 1),
+                "names": axes,
+                "info": {"is_depth_map": True},
+            },
+        },
+    )
+    depth = np.rint(1000 * plane_depth(camera, height=0.02)).astype(np.uint16)[..., None]
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        angles = rng.normal(size=6).astype(np.float32)
+        rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
+        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
+        source.add_frame(frame | {"task": "nothing"})
+    source.save_episode()
+    source.finalize()
+    file = tmp_path / "cameras.json"
+    calibration = Calibration({"front": camera}, Workspace(size=0.3))
+    file.write_text(json.dumps(plain_calibration(calibration)))
+    options = {"reproj": make_view("reproj", clip="none", source_scale=3), "persp": make_view("persp", gripper=False)}
+    result = add_views(
+        views_config(tmp_path / "real", tmp_path / "derived", camera="front", calibration=file, **options)
+    )
+    heights = images_of(result, keys.view("front", "reproj_height"))
+    np.testing.assert_allclose(heights, 0.02, atol=0.001)
+    for name in ("reproj", "persp"):
+        color = images_of(result, keys.view("front", name)) * 255
+        assert np.abs(color - np.reshape([200, 100, 50], (1, 3, 1, 1))).max() <= (4 if use_videos else 0.01)
+    facts = json.loads((result / "meta" / "info.json").read_text())["features"][keys.view("front", "reproj")]["info"]
+    assert facts["symview"]["workspace"]["size"] == 0.3
+    assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
 
 
 def test_without_the_grippers_pose_the_flags_that_do_without_are_named(recorded, tmp_path):
