@@ -122,8 +122,8 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
             config.camera, calibration.camera(config.camera), workspace, f"check the poses in {config.calibration}"
         )
         added |= calibration_features(config.camera)
+    stated = plain_calibration(calibration) if calibration is not None else None
     for name, view in views.items():
-        stated = plain_calibration(calibration) if calibration is not None else None
         added |= view_features(config.camera, name, view, workspace, stated)
     kept = None if config.keep is None else {keys.rgb(name) for name in config.keep}
     dropped = [

@@ -1,4 +1,4 @@
-"""Views of many frames at once as torch tensors, on whatever device these are: the same bits as one by one.
+"""Views of many frames at once as torch tensors, on whatever device these are, with the bits they have one by one.
 
 Every step is a separate operation in float64 or in integers, so that no device may fuse two and round differently. This
 is for GPUs: on a CPU the compiled kernels of `views` are faster.

@@ -15,7 +15,7 @@ import json
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -65,22 +65,19 @@ class Derivation:
 
     def reader(self, source: SourceDataset) -> FrameReader:
         """Return what puts the frames of `source` together."""
-        return FrameReader(
-            source,
-            self.camera,
-            self.workspace,
-            depth=any(view.needs_depth for view in self.views.values()),
-            gripper=any(view.needs_gripper for view in self.views.values()),
-            calibration=self.calibration,
-        )
+        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration)
 
-    def image_kinds(self) -> dict[str, str]:
+    def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
         """Return `rgb` or `height` for every new image feature."""
         return {
             keys.view(self.camera, output): kind
             for view in self.views.values()
             for output, kind in view.outputs.items()
         }
+
+    def no_statistics(self) -> dict[str, ImageStatistics]:
+        """Return the statistics of no image, for every new image feature."""
+        return {key: ImageStatistics.empty(kind) for key, kind in self.image_kinds().items()}
 
     def table_file(self, source: SourceDataset, part: int) -> Path:
         """Where a part's table is in the result."""
@@ -131,8 +128,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     table_file, statistics_file = derivation.table_file(source, index), derivation.statistics_file(index)
     if table_file.exists():
         return count
-    kinds = derivation.image_kinds()
-    merged = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    merged = derivation.no_statistics()
     summaries = {}
     reader = derivation.reader(source)
     kept = [name for name in derivation.schema.names if name not in derivation.added]
@@ -167,8 +163,7 @@ def _render(
     derivation: Derivation, reader: FrameReader, episode: int, table: pa.Table
 ) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
     """Return the new columns of an episode, and the statistics of its new images."""
-    kinds = derivation.image_kinds()
-    statistics = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    kinds, statistics = derivation.image_kinds(), derivation.no_statistics()
     encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
     for frame in reader.frames(episode, table):
         for view in derivation.views.values():
@@ -238,14 +233,12 @@ def _collect_statistics(
     derivation: Derivation, source: SourceDataset, parts: list[range]
 ) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
     """Return the statistics of every new feature over the dataset, and over each episode."""
-    kinds = derivation.image_kinds()
-    totals = {key: ImageStatistics.empty(kind) for key, kind in kinds.items()}  # type: ignore[arg-type]
+    totals = derivation.no_statistics()
     summaries: dict[int, dict[str, Any]] = {}
     for part in range(len(parts)):
         with np.load(derivation.statistics_file(part)) as content:
             for key, total in totals.items():
-                counted = (content[f"{key}/{name}"] for name in ("images", "counts", "sums"))
-                images, counts, sums = counted
+                images, counts, sums = (content[f"{key}/{name}"] for name in ("images", "counts", "sums"))
                 total.merge(ImageStatistics(total.kind, int(images), counts, sums))
             summaries |= {int(episode): one for episode, one in json.loads(str(content["summaries"])).items()}
     collected = {key: total.summary() for key, total in totals.items()}

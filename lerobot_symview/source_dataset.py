@@ -6,7 +6,7 @@ Tables are read as they are: LeRobot itself, which takes seconds to import, is n
 from __future__ import annotations
 
 import json
-from collections.abc import Buffer, Iterator
+from collections.abc import Buffer, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice, repeat
@@ -24,7 +24,7 @@ from lerobot_symview.camera import MILLIMETRES_PER_METRE, CalibrationError, Came
 from lerobot_symview.cli import CommandError
 from lerobot_symview.features import Features
 from lerobot_symview.image_codec import decode_depth, decode_rgb
-from lerobot_symview.views import Frame
+from lerobot_symview.views import Frame, View
 from lerobot_symview.workspace import Workspace
 
 VIDEO_FRAMES = 64  # decoded at a time
@@ -165,17 +165,25 @@ class FrameReader:
         dataset: where they are.
         camera: which camera.
         workspace: what its views are to show.
-        depth: whether depth is wanted.
-        gripper: whether the gripper's state is wanted.
+        views: what the frames are for, which decides what they hold.
         calibration: the camera's, where the dataset has none of its own.
     """
 
     dataset: SourceDataset
     camera: str
     workspace: Workspace
-    depth: bool
-    gripper: bool
+    views: Collection[View]
     calibration: Calibration | None = None
+
+    @property
+    def depth(self) -> bool:
+        """Whether depth is wanted."""
+        return any(view.needs_depth for view in self.views)
+
+    @property
+    def gripper(self) -> bool:
+        """Whether the gripper's state is wanted."""
+        return any(view.needs_gripper for view in self.views)
 
     def columns(self) -> list[str]:
         """Return the columns of the tables that `frames` reads; what is video is not among them."""

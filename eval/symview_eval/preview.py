@@ -91,12 +91,16 @@ class Moment:
         return f"episode {self.episode}, frame {self.index}"
 
 
-def read_moment(source: SourceDataset, reader: FrameReader | None, episode: int, index: int) -> Moment:
-    """Return one frame of an episode."""
-    table = EpisodeTables(source, source.data_file(episode)).read(episode).slice(index, 1)
+def read_moments(source: SourceDataset, reader: FrameReader | None, episode: int, indices: list[int]) -> list[Moment]:
+    """Return some frames of an episode."""
+    table = EpisodeTables(source, source.data_file(episode)).read(episode)
     images = [key for key, feature in source.features.items() if feature["dtype"] in ("image", "video")]
-    stored = {key.removeprefix(keys.rgb("")): next(source.images(key, episode, table)) for key in images}
-    return Moment(episode, index, next(reader.frames(episode, table)) if reader else None, stored)
+    moments = []
+    for index in indices:
+        row = table.slice(index, 1)
+        stored = {key.removeprefix(keys.rgb("")): next(source.images(key, episode, row)) for key in images}
+        moments.append(Moment(episode, index, next(reader.frames(episode, row)) if reader else None, stored))
+    return moments
 
 
 @dataclass(frozen=True)
@@ -126,8 +130,8 @@ def preview(config: PreviewConfig) -> Path:
     rows, measured = [], []
     for episode in tqdm(config.episodes, desc="preview", unit="episode"):
         length = source.episodes[episode]["length"]
-        for index in np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist():
-            moment = read_moment(source, reader, episode, index)
+        indices = np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist()
+        for moment in read_moments(source, reader, episode, indices):
             if moment.frame is None or reader is None:
                 shown = {name: _shown(image) for name, image in moment.stored.items()}
                 rows.append(Row(moment.title, [], shown))
@@ -161,14 +165,8 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
     has_depth = keys.depth(config.camera) in source.features
     names = config.views or [name for name, view in options.items() if has_depth or not view.needs_depth]
     views = choose_views(names, config.size, options)
-    reader = FrameReader(
-        source,
-        config.camera,
-        stated or stored_workspace(source.features),
-        depth=any(view.needs_depth for view in views.values()),
-        gripper=any(view.needs_gripper for view in views.values()),
-        calibration=calibration,
-    )
+    workspace = stated or stored_workspace(source.features)
+    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
     reader.check()
     return reader, views
 

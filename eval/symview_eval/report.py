@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview.source_dataset import SourceDataset
 from symview_eval.contact_sheet import data_uri, png_uri
-from symview_eval.preview import read_moment
+from symview_eval.preview import read_moments
 from symview_eval.stages import Stage
 from symview_eval.statistics import SuccessRate
 
@@ -59,7 +59,7 @@ def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float
     recorded, views, _, evaluation = (stage.result for stage in stages)
     images: dict[str, NDArray] = {}
     for folder in (recorded, views):
-        images |= read_moment(SourceDataset(folder), None, 0, MOMENT).stored
+        images |= read_moments(SourceDataset(folder), None, 0, [MOMENT])[0].stored
     videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined

@@ -8,7 +8,7 @@ from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.source_dataset import SourceDataset
 from lerobot_symview.workspace import Workspace
 from symview_eval.contact_sheet import OUTLINE, with_outline
-from symview_eval.preview import PreviewConfig, preview, read_moment, table_resolution
+from symview_eval.preview import PreviewConfig, preview, read_moments, table_resolution
 from tests.conftest import make_camera
 
 
@@ -61,7 +61,7 @@ def test_impossible_options_are_refused(option, value):
 
 def test_a_moment_is_read_from_its_row(recorded):
     source = SourceDataset(recorded)
-    first, later = (read_moment(source, None, 1, index) for index in (0, 5))
+    first, later = read_moments(source, None, 1, [0, 5])
     assert first.title == "episode 1, frame 0"
     assert set(first.stored) == {"side", "side_depth", "top", "top_depth"}
     assert (first.stored["side"] != later.stored["side"]).any()
