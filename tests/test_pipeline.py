@@ -89,7 +89,7 @@ def test_a_checkpoint_is_evaluated_on_several_tasks_at_once(tiny_demo, tmp_path)
 
 def test_lerobots_commands_list_our_options():
     train = run("lerobot-train", "--policy.type=symview_bc", "--help")
-    for option in ("--policy.view", "--policy.crop_size", "--policy.rotation_augmentation"):
+    for option in ("--policy.view", "--policy.crop_size", "--policy.augmentation", "--policy.method"):
         assert option in train.stdout
     evaluate = run("lerobot-eval", "--env.type=symview", "--help")
     for option in ("--env.task", "--env.camera.elevation_deg", "--env.oracle", "--env.views"):

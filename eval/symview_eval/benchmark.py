@@ -17,6 +17,7 @@ from tqdm import tqdm
 from lerobot_symview.cli import USAGE, run_command
 from lerobot_symview.names import lookup
 from symview_eval.clock import Clock
+from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from symview_sim.settings import EnvSettings
@@ -32,7 +33,8 @@ TIMED = {
 EXAMPLES = """\
   symview-benchmark experts --seeds=200
   symview-benchmark env --json=true
-  symview-benchmark views"""
+  symview-benchmark views
+  symview-benchmark policy --batch_size=32"""
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,7 @@ SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "experts": (ExpertsBenchmark, benchmark_experts),
     "env": (EnvBenchmark, benchmark_env),
     "views": (ViewsBenchmark, benchmark_views),
+    "policy": (PolicyBenchmark, benchmark_policy),
 }
 
 

@@ -1,21 +1,37 @@
-"""Image transformations of training: turning about the centre and cropping."""
+"""Transformations of training: moving scenes about the workspace centre, and cropping."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from lerobot_policy_symview.symmetry import Motion
 
-def turn_images(images: Tensor, angle: Tensor) -> Tensor:
-    """Turn top-down images (B, C, H, H) as the scene turns by `angle` (B,) radians about z; edges are extended.
+AUGMENTATIONS = {"d4": (4, True), "so2": (None, False), "o2": (None, True)}
 
-    A quarter turn equals `torch.rot90(images, 1, (-2, -1))`, by DESIGN's pixel convention: rows grow with x, columns
-    with y.
+
+def random_motion(augmentation: str, like: Tensor) -> Motion:
+    """Draw one motion per sample of `like` (B, ...): quarter turns or any, with mirror images or without."""
+    turns, mirrors = AUGMENTATIONS[augmentation]
+    angle = torch.rand(len(like), device=like.device, dtype=like.dtype)
+    angle = 2 * math.pi * (angle if turns is None else (angle * turns).floor() / turns)
+    mirrored = torch.rand(len(like), device=like.device) < (0.5 if mirrors else 0.0)
+    return Motion(angle, mirrored)
+
+
+def move_images(images: Tensor, motion: Motion) -> Tensor:
+    """Move top-down images (B, C, H, H) as the scene moves; edges are extended.
+
+    A quarter turn equals `torch.rot90(images, 1, (-2, -1))` and a mirror image `images.flip(-1)`, by DESIGN's pixel
+    convention: rows grow with x, columns with y.
     """
-    cos, sin = torch.cos(angle), torch.sin(angle)
+    cos, sin, sign = torch.cos(motion.angle), torch.sin(motion.angle), motion.sign
     zero = torch.zeros_like(cos)
-    theta = torch.stack([torch.stack([cos, -sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
+    # grid_sample asks where an output pixel (column, row) is read: at the inverse motion of its place (y, x)
+    theta = torch.stack([torch.stack([sign * cos, -sign * sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
     grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
     return functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 

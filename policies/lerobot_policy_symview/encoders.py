@@ -1,129 +1,140 @@
-"""Networks from image channels to a scaled action, and the registry `--policy.encoder` chooses from."""
+"""The encoders of images and voxels, and the registry `--policy.encoder` chooses from.
+
+The plain network is the equivariant one's layout for the group of one element.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
-from lerobot_policy_symview.escnn_import import enn, gspaces
-from lerobot_policy_symview.symmetry import ThetaRepresentation
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.encoder import Encoder
+from lerobot_policy_symview.groups import PlanarGroup, block_diagonal
+from lerobot_policy_symview.layers import FieldConv2d, FieldConv3d, RelaxedConv2d
+from lerobot_policy_symview.point_encoder import PointEncoder
+from lerobot_policy_symview.voxels import VOXEL_CHANNELS
+
+Convolution = Callable[[PlanarGroup, int | NDArray[np.float64], int, int], nn.Module]
 
 
-def stage_widths(crop_size: int, width: int) -> list[int]:
-    """Widths of the convolutions that each halve the image, down to 8 px; the paper's for 128 px, one fewer for 64."""
-    return {128: [width // 8, width // 4, width // 2, width], 64: [width // 4, width // 2, width]}[crop_size]
-
-
-class EquivariantEncoder(nn.Module):
-    """D4-equivariant convolutions from trivial channels to an action (paper A.4; 1,112,680 parameters at width 64).
+class ImageEncoder(Encoder):
+    """Seven convolutions from 128 px to one, six from 64 px (paper A.4; 1,112,680 parameters for five channels).
 
     Args:
-        channels: input channels, each a scalar field on the table.
-        crop_size: rows and columns of the input, one of the configuration's `CROP_SIZES`.
-        width: regular fields of the widest but one layer (the paper's n).
-        action_kinds: declaration of the action's entries, see `symmetry`.
-        theta_representation: representation of yaw increments; `trivial` is the paper's text, `sign` is right.
-        initialize: draw escnn's He initialisation, which takes seconds; not needed before weights are loaded.
+        group: G elements.
+        channels: of the picture, each a scalar field on the table.
+        state: (G, D, D), the representation of the state, which every pixel gets.
+        stages: fields of the convolutions that each halve the image, down to 8 px.
+        fields: of the last three convolutions.
+        convolution: makes a layer of a group, inputs, fields and padding.
     """
 
     def __init__(
         self,
+        group: PlanarGroup,
         channels: int,
-        crop_size: int,
-        width: int,
-        action_kinds: Sequence[str],
-        theta_representation: ThetaRepresentation,
-        initialize: bool,
+        state: NDArray[np.float64],
+        stages: list[int],
+        fields: tuple[int, int, int],
+        convolution: Convolution = FieldConv2d,
     ):
-        super().__init__()
-        space = gspaces.flipRot2dOnR2(4)
-        fields = {"vector": space.irrep(1, 1), "sign": space.irrep(1, 0), "trivial": space.trivial_repr}
-        self.in_type = enn.FieldType(space, channels * [space.trivial_repr])
-        layers: list[enn.EquivariantModule] = []
-        current = self.in_type
+        super().__init__(group, fields[-1])
+        inputs: list[int | NDArray[np.float64]] = [scalars(group, channels, state), *stages, *fields[:-1]]
+        paddings = [1] * (len(stages) + 1) + [0, 0]
+        self.layers = nn.ModuleList(
+            convolution(group, before, after, padding)
+            for before, after, padding in zip(inputs, [*stages, *fields], paddings, strict=True)
+        )
+        self.pooled = [True] * len(stages) + [False, True, False]
 
-        def convolution(fields: int, padding: int, pool: bool) -> None:
-            nonlocal current
-            out_type = enn.FieldType(space, fields * [space.regular_repr])
-            layers.append(enn.R2Conv(current, out_type, 3, padding=padding, initialize=initialize))
-            layers.append(enn.ReLU(out_type))
-            if pool:
-                layers.append(enn.PointwiseMaxPool(out_type, 2))
-            current = out_type
-
-        for fields_out in stage_widths(crop_size, width):
-            convolution(fields_out, padding=1, pool=True)
-        convolution(2 * width, padding=1, pool=False)
-        convolution(width, padding=0, pool=True)
-        convolution(width, padding=0, pool=False)
-        self.encoder = enn.SequentialModule(*layers)
-
-        order, types = _head_fields(action_kinds, theta_representation)
-        out_type = enn.FieldType(space, [fields[name] for name in types])
-        self.head = enn.R2Conv(current, out_type, 1, initialize=initialize)
-        self.register_buffer("order", torch.tensor(order), persistent=False)
-        for buffer in self.buffers():  # escnn's bases are strided views, which safetensors cannot write
-            buffer.data = buffer.contiguous()
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Map images (B, C, crop, crop) to scaled actions (B, A)."""
-        features = self.head(self.encoder(enn.GeometricTensor(images, self.in_type))).tensor
-        return features.flatten(1)[:, self.order]
+    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
+        """Map pictures (B, C, crop, crop) and states (B, D) to features (B, G, n)."""
+        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
+        features = torch.cat([picture, planes], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
+            features = features.contiguous(memory_format=torch.channels_last)
+        for layer, pool in zip(self.layers, self.pooled, strict=True):
+            features = layer(features, pool)
+            if not pool:
+                features = functional.relu(features)
+        return self.split(features)
 
 
-def _head_fields(kinds: Sequence[str], theta: ThetaRepresentation) -> tuple[list[int], list[str]]:
-    """Return which output channel each action entry is, and the field types that yield those channels."""
-    types, channel_of, channels = [], {}, 0
-    if "x" in kinds:
-        types.append("vector")
-        channel_of.update({kinds.index("x"): 0, kinds.index("y"): 1})
-        channels = 2
-    for entry, kind in enumerate(kinds):
-        if kind not in ("x", "y"):
-            types.append("sign" if kind == "yaw" and theta == "sign" else "trivial")
-            channel_of[entry] = channels
-            channels += 1
-    return [channel_of[entry] for entry in range(len(kinds))], types
+class VoxelEncoder(Encoder):
+    """The image encoder in three dimensions, for 32 x 64 x 64 voxels; turns and mirrors move the last two axes.
+
+    Args:
+        group: G elements.
+        state: (G, D, D), the representation of the state, which every voxel gets.
+        width: n of the corresponding image encoder; 64 gives 1.18 M parameters.
+    """
+
+    def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
+        super().__init__(group, width // 2)
+        fields = [width // 16, width // 8, width // 4, width // 2, width, width // 2, width // 2]
+        inputs: list[int | NDArray[np.float64]] = [scalars(group, VOXEL_CHANNELS, state), *fields[:-1]]
+        paddings = [(1, 1, 1)] * 5 + [(1, 0, 0), (0, 0, 0)]
+        heights = [3] * 6 + [2]
+        self.layers = nn.ModuleList(
+            FieldConv3d(group, before, after, padding, height)
+            for before, after, padding, height in zip(inputs, fields, paddings, heights, strict=True)
+        )
+        self.pooled = [True, True, True, False, False, True, False]
+
+    def forward(self, voxels: Tensor, state: Tensor) -> Tensor:
+        """Map voxels (B, C, 32, 64, 64) and states (B, D) to features (B, G, n / 2)."""
+        blocks = state[:, :, None, None, None].expand(-1, -1, *voxels.shape[-3:])
+        features = torch.cat([voxels, blocks], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
+            features = features.contiguous(memory_format=torch.channels_last_3d)
+        for layer, pool in zip(self.layers, self.pooled, strict=True):
+            features = layer(features, pool)
+            if not pool:
+                features = functional.relu(features)
+        return self.split(features)
 
 
-class PlainEncoder(nn.Module):
-    """The same layout without symmetry; 16, 32, 64, 128, 128, 256, 256 channels, 1.13 M weights at the paper's size."""
-
-    def __init__(
-        self,
-        channels: int,
-        crop_size: int,
-        width: int,
-        action_kinds: Sequence[str],
-        theta_representation: ThetaRepresentation,
-        initialize: bool,
-    ):
-        super().__init__()
-        layers: list[nn.Module] = []
-        current = channels
-
-        def convolution(out: int, padding: int, pool: bool) -> None:
-            nonlocal current
-            layers.extend([nn.Conv2d(current, out, 3, padding=padding), nn.ReLU()])
-            if initialize:
-                nn.init.xavier_normal_(layers[-2].weight)  # type: ignore[arg-type]
-            if pool:
-                layers.append(nn.MaxPool2d(2))
-            current = out
-
-        for out in stage_widths(crop_size, width):
-            convolution(2 * out, padding=1, pool=True)
-        convolution(2 * width, padding=1, pool=False)
-        convolution(4 * width, padding=0, pool=True)
-        convolution(4 * width, padding=0, pool=False)
-        self.encoder = nn.Sequential(*layers, nn.Flatten(), nn.Linear(current, len(action_kinds)))
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Map images (B, C, crop, crop) to scaled actions (B, A)."""
-        actions: Tensor = self.encoder(images)
-        return actions
+def scalars(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the representation of `count` scalars followed by `others` (G, D, D)."""
+    return block_diagonal([np.ones((group.size, 1, 1))] * count + [others])
 
 
-ENCODERS: dict[str, Callable[..., nn.Module]] = {"equivariant": EquivariantEncoder, "plain": PlainEncoder}
+def _stages(config: SymviewBcConfig) -> list[int]:
+    n = config.width
+    return {128: [n // 8, n // 4, n // 2, n], 64: [n // 4, n // 2, n]}[config.crop_size]
+
+
+def _full(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, padding: int) -> FieldConv2d:
+    return FieldConv2d(group, inputs, fields, padding, full=True)
+
+
+def _equivariant(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    fields = (2 * config.width, config.width, config.width)
+    return ImageEncoder(group, config.channels, state, _stages(config), fields)
+
+
+def _relaxed(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    fields = (2 * config.width, config.width, config.width)
+    return ImageEncoder(group, config.channels, state, _stages(config), fields, RelaxedConv2d)
+
+
+def _plain(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the lineage's 16, 32, 64, 128, 128, 256, 256 channels at the paper's size: 1.13 M parameters."""
+    stages = [2 * fields for fields in _stages(config)]
+    fields = (2 * config.width, 4 * config.width, 4 * config.width)
+    return ImageEncoder(group, config.channels, state, stages, fields, _full)
+
+
+ENCODERS: dict[str, Callable[[SymviewBcConfig, PlanarGroup, NDArray[np.float64]], Encoder]] = {
+    "equivariant": _equivariant,
+    "plain": _plain,
+    "relaxed": _relaxed,
+    "voxel": lambda config, group, state: VoxelEncoder(group, state, config.width),
+    "point_cloud": lambda config, group, state: PointEncoder(group, state, config.width),
+}

@@ -2,76 +2,120 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from contextlib import nullcontext
+from copy import deepcopy
+from typing import Any, Literal
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from torch import Tensor
-from torch.nn import functional
+from torch import Tensor, nn
 
-from lerobot_policy_symview.augmentation import center_crop, random_crop, turn_images
-from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion
+from lerobot_policy_symview.clouds import cloud_from_depth
+from lerobot_policy_symview.configuration_symview_bc import LIFTING, SymviewBcConfig
 from lerobot_policy_symview.encoders import ENCODERS
+from lerobot_policy_symview.groups import make_group
+from lerobot_policy_symview.heads import RegressionHead
+from lerobot_policy_symview.layers import RelaxedConv2d
+from lerobot_policy_symview.point_encoder import POINTS
 from lerobot_policy_symview.processor_views import metres
-from lerobot_policy_symview.symmetry import symmetric_range, turn
+from lerobot_policy_symview.state_input import StateInput, camera_directions
+from lerobot_policy_symview.symmetry import Motion, Symmetry
+from lerobot_policy_symview.voxels import voxelize
 from lerobot_symview import keys
+from lerobot_symview.calibration import parse_workspace
 from lerobot_symview.gripper import gripper_image
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.views import ReprojectedView
+
+
+class Network(nn.Module):
+    """An encoder and its head.
+
+    Args:
+        config: what to build.
+        inputs: the numbers beside the picture.
+    """
+
+    def __init__(self, config: SymviewBcConfig, inputs: StateInput):
+        super().__init__()
+        group = make_group(config.group)
+        self.encoder = ENCODERS[config.encoder](config, group, inputs.representation(group))
+        actions = config.actions.representation(group, config.theta_representation)
+        self.head = RegressionHead(self.encoder.fields, actions)
+
+    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
+        """Map what the policy sees to scaled actions (B, A)."""
+        actions: Tensor = self.head(self.encoder(picture, state))
+        return actions
 
 
 class SymviewBcPolicy(PreTrainedPolicy):
     """Predicts the expert's action from one observation by least squares.
 
-    Its inputs and outputs are physical: images in [0, 1], metres, radians. Everything between commutes with D4 when the
-    encoder is equivariant: the crop in evaluation, the drawn gripper, the scaling of the action.
+    Its inputs and outputs are physical: images in [0, 1], metres, radians. Everything between commutes with the
+    network's group: the crop in evaluation, the drawn gripper, the scaling of states and actions.
     """
 
     config_class = SymviewBcConfig
     name = "symview_bc"
+    action_center: Tensor
+    action_width: Tensor
+    state_center: Tensor
+    state_width: Tensor
 
     def __init__(self, config: SymviewBcConfig, dataset_stats: dict[str, dict[str, Any]] | None = None, **kwargs: Any):
         super().__init__(config)
         config.validate_features()
         self.config: SymviewBcConfig = config
-        workspace = dict(config.workspace)
-        self.workspace = Workspace(**(workspace | {"center": tuple(workspace["center"])}))
-        self.network = ENCODERS[config.encoder](
-            channels=config.channels,
-            crop_size=config.crop_size,
-            width=config.width,
-            action_kinds=config.action_symmetry,
-            theta_representation=config.theta_representation,
-            initialize=not config.pretrained_path,
-        )
-        center, width = torch.zeros(len(config.action_symmetry)), torch.ones(len(config.action_symmetry))
-        if dataset_stats is not None and keys.ACTION in dataset_stats:
-            stats = dataset_stats[keys.ACTION]
-            minimum, maximum = (torch.as_tensor(stats[name], dtype=torch.float32) for name in ("min", "max"))
-            center, width = symmetric_range(minimum, maximum, config.action_symmetry)
-        self.register_buffer("action_center", center)
-        self.register_buffer("action_width", width)
+        self.workspace = parse_workspace(config.workspace)
+        self.inputs = StateInput(config, self.workspace)
+        self.network = Network(config, self.inputs)
+        self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
+        stats = dataset_stats or {}
+        action = _scale(stats.get(keys.ACTION), config.actions)
+        state = self.inputs.scale(*_scale(stats.get(keys.STATE), config.states))
+        for name, (center, width) in {"action": action, "state": state}.items():
+            self.register_buffer(f"{name}_center", center)
+            self.register_buffer(f"{name}_width", width)
 
     def get_optim_params(self) -> Any:
-        """Return every parameter: one rate for all."""
-        return self.parameters()
+        """Return every parameter that is trained: one rate for all."""
+        return self.network.parameters()
 
     def reset(self) -> None:
         """Nothing is remembered between steps."""
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Return the mean squared error of the scaled action, and it again under `mse` for the log."""
-        images, state, action = self._images(batch), batch[keys.STATE], batch[keys.ACTION]
-        if self.training and self.config.rotation_augmentation:
-            angle = torch.rand(len(state), device=state.device, dtype=state.dtype) * 2 * math.pi
-            images = turn_images(images, angle)
-            state = turn(state, self.config.state_symmetry, angle, absolute_yaw=True)
-            action = turn(action, self.config.action_symmetry, angle, absolute_yaw=False)
-        channels = self._with_gripper(images, state)
-        crop = random_crop if self.training else center_crop
-        predicted = self.network(crop(channels, self.config.crop_size))
-        loss = functional.mse_loss(predicted, (action - self.action_center) / self.action_width)
-        return loss, {"mse": loss.item()}
+    def update(self) -> None:
+        """Let the averaged weights follow; LeRobot calls this after every optimiser step."""
+        if self.averaged is not None:
+            with torch.no_grad():
+                for average, current in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
+                    average.lerp_(current, 1 - self.config.weight_averaging)
+
+    def forward(
+        self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Return the squared error of the scaled action, mean or (B,), and what else the log should show.
+
+        That is nothing but for relaxed networks: reading a number from a GPU would make every step wait for it.
+        """
+        motion = None
+        if self.training and self.config.augmentation != "none":
+            motion = random_motion(self.config.augmentation, batch[keys.STATE])
+        action = batch[keys.ACTION]
+        if motion is not None:
+            action = self.config.actions.move(action, motion, absolute_yaw=False)
+        picture, state = self.network_input(batch, motion)
+        features = self.network.encoder(picture, state)
+        errors = self.network.head.loss(features, (action - self.action_center) / self.action_width).mean(dim=1)
+        output = {}
+        if self.config.encoder == "relaxed":
+            asymmetry = torch.stack(
+                [layer.asymmetry() for layer in self.network.modules() if isinstance(layer, RelaxedConv2d)]
+            ).sum()
+            output["asymmetry"] = asymmetry.item()
+            errors = errors + self.config.relaxation_weight * asymmetry
+        return (errors if reduction == "none" else errors.mean()), output
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return actions (B, 1, A): dx, dy, dz in metres, dyaw in radians, aperture, in the declared order."""
@@ -81,9 +125,31 @@ class SymviewBcPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the action (B, A) for observations (B, ...)."""
         self.eval()
-        channels = self._with_gripper(self._images(batch), batch[keys.STATE])
-        scaled: Tensor = self.network(center_crop(channels, self.config.crop_size))
+        network = self.network if self.averaged is None else self.averaged
+        reduced = self.config.dtype == "bfloat16"
+        with torch.autocast(self.action_center.device.type, torch.bfloat16) if reduced else nullcontext():
+            scaled: Tensor = network(*self.network_input(batch))
         return scaled * self.action_width + self.action_center
+
+    def network_input(self, batch: dict[str, Tensor], motion: Motion | None = None) -> tuple[Tensor, Tensor]:
+        """Return the picture and the state (B, D) that the network gets, of the scene after a motion."""
+        state = batch[keys.STATE]
+        direction = None
+        if self.config.camera_direction:
+            direction = camera_directions(batch[keys.world_from_cam(self.config.camera)], self.workspace)
+        picture = self._points(batch, motion) if self.config.encoder in LIFTING else self._images(batch)
+        if motion is not None:
+            state = self.config.states.move(state, motion, absolute_yaw=True)
+            if self.config.encoder not in LIFTING:
+                picture = move_images(picture, motion)
+            if direction is not None:
+                direction = torch.stack(motion.move(*direction.unbind(-1)), dim=-1)
+        if self.config.gripper_input == "image":
+            picture = torch.cat([picture, self._gripper(state, picture.shape[-1])[:, None]], dim=1)
+        if self.config.encoder not in LIFTING:
+            crop = random_crop if self.training else center_crop
+            picture = crop(picture, self.config.crop_size)
+        return picture, self.inputs(state, self.state_center, self.state_width, direction)
 
     def _images(self, batch: dict[str, Tensor]) -> Tensor:
         """Colour in [0, 1] and, for `rgbd`, height relative to the working volume (a camera's own depth in metres)."""
@@ -99,14 +165,32 @@ class SymviewBcPolicy(PreTrainedPolicy):
             height = height / self.workspace.height_limit
         return torch.cat([color, height], dim=1)
 
-    def _with_gripper(self, images: Tensor, state: Tensor) -> Tensor:
-        """Append the gripper to images (B, C, H, W): its picture and height if wanted, and its aperture."""
-        entry = {kind: state[:, i] for i, kind in enumerate(self.config.state_symmetry)}
-        constants = [entry["aperture"]]
-        pictures = []
-        if self.config.gripper_input == "image":
-            gripper = torch.stack([entry[kind] for kind in ("x", "y", "z", "yaw", "aperture")], dim=-1)
-            pictures.append(gripper_image(gripper, self.workspace, images.shape[-1])[:, None])
-            constants.append(entry["z"] / self.workspace.height_limit)
-        planes = [value[:, None, None, None].expand(-1, 1, *images.shape[-2:]) for value in constants]
-        return torch.cat([images, *pictures, *planes], dim=1)
+    def _points(self, batch: dict[str, Tensor], motion: Motion | None) -> Tensor:
+        """The camera's image lifted to space, as voxels (B, 4, Z, X, Y) or as points (B, P, 6)."""
+        camera, view = self.config.camera, ReprojectedView()
+        gripper_z = batch[keys.STATE][:, self.config.state_symmetry.index("z")]
+        cloud = cloud_from_depth(
+            batch[keys.rgb(camera)],
+            metres(batch[keys.depth(camera)]),
+            batch[keys.intrinsics(camera)],
+            batch[keys.world_from_cam(camera)],
+            self.workspace,
+            (gripper_z - view.clip_margin).clamp(min=view.clip_floor),
+        )
+        if motion is not None:
+            cloud = cloud.moved(motion)
+        if self.config.encoder == "voxel":
+            return voxelize(cloud, self.workspace)
+        return cloud.sample(POINTS, shuffle=self.training)
+
+    def _gripper(self, state: Tensor, pixels: int) -> Tensor:
+        """Draw the gripper (B, pixels, pixels)."""
+        entries = [state[:, self.config.state_symmetry.index(kind)] for kind in keys.STATE_NAMES]
+        picture: Tensor = gripper_image(torch.stack(entries, dim=-1), self.workspace, pixels)
+        return picture
+
+
+def _scale(stats: dict[str, Any] | None, symmetry: Symmetry) -> tuple[Tensor, Tensor]:
+    if stats is None:
+        return torch.zeros(len(symmetry.entries)), torch.ones(len(symmetry.entries))
+    return symmetry.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ("min", "max")))

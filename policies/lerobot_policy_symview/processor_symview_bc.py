@@ -19,14 +19,16 @@ def make_symview_bc_pre_post_processors(
 ]:
     """Return LeRobot's usual pipelines, with the policy's view computed where an observation lacks it."""
     steps = make_default_policy_processor_steps(config, dataset_stats)
-    views = {config.view: config.view_options} if config.is_computed else {}
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,
             steps.add_batch_dim,
             steps.to_device,
             ViewsProcessorStep(
-                views=views, camera=config.camera, workspace=config.workspace, calibration=config.calibration
+                views=config.computed_views,
+                camera=config.camera,
+                workspace=config.workspace,
+                calibration=config.calibration,
             ),
             steps.normalize,
         ],

@@ -3,22 +3,52 @@ import math
 import pytest
 import torch
 
-from lerobot_policy_symview.augmentation import center_crop, random_crop, turn_images
+from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion
+from lerobot_policy_symview.groups import make_group
+from lerobot_policy_symview.symmetry import Motion, Symmetry
+from lerobot_symview.gripper import gripper_image
+from lerobot_symview.workspace import Workspace
 
 IMAGES = torch.rand(2, 3, 12, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
 
-@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_a_quarter_turn_is_rot90(quarter_turns):
-    angle = torch.full((2,), quarter_turns * math.pi / 2, dtype=torch.float64)
-    torch.testing.assert_close(turn_images(IMAGES, angle), torch.rot90(IMAGES, quarter_turns, (-2, -1)))
+@pytest.mark.parametrize("element", range(8))
+def test_elements_of_d4_move_pixels_onto_pixels(element):
+    group = make_group("D4")
+    flipped = IMAGES.flip(-1) if group.flips(element) else IMAGES
+    moved = move_images(IMAGES, Motion.of_element(group, element, IMAGES.flatten(1)))
+    torch.testing.assert_close(moved, torch.rot90(flipped, element % 4, (-2, -1)))
 
 
-def test_images_of_a_batch_turn_by_their_own_angles():
-    angle = torch.tensor([0.0, math.pi], dtype=torch.float64)
-    turned = turn_images(IMAGES, angle)
-    torch.testing.assert_close(turned[0], IMAGES[0])
-    torch.testing.assert_close(turned[1], IMAGES[1].flip((-2, -1)))
+def test_images_of_a_batch_move_by_their_own_motions():
+    motion = Motion(torch.tensor([0.0, math.pi], dtype=torch.float64), torch.tensor([True, False]))
+    moved = move_images(IMAGES, motion)
+    torch.testing.assert_close(moved[0], IMAGES[0].flip(-1))
+    torch.testing.assert_close(moved[1], IMAGES[1].flip((-2, -1)))
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("angle", [0.3, 1.9, 4.0])
+def test_a_moved_picture_shows_the_moved_gripper(angle, mirrored):
+    """The drawn gripper is known at any angle: what the image's motion has to agree with."""
+    state = torch.tensor([[0.06, -0.04, 0.2, 0.4, 1.0]], dtype=torch.float64)
+    motion = Motion(torch.tensor([angle], dtype=torch.float64), torch.tensor([mirrored]))
+    moved = Symmetry(("x", "y", "z", "yaw", "aperture")).move(state, motion, absolute_yaw=True)
+    drawn = gripper_image(state, Workspace(), 128)[:, None]
+    expected = gripper_image(moved, Workspace(), 128)[:, None]
+    assert (move_images(drawn, motion) - expected).abs().mean() < 0.15 * expected.mean()
+
+
+@pytest.mark.parametrize("augmentation", ["d4", "so2", "o2"])
+def test_random_motions_reach_all_they_may_and_nothing_else(augmentation):
+    torch.manual_seed(0)
+    motion = random_motion(augmentation, torch.zeros(400, 5))
+    quarters = motion.angle / (math.pi / 2)
+    assert motion.mirrored.float().mean() == (0.0 if augmentation == "so2" else pytest.approx(0.5, abs=0.1))
+    if augmentation == "d4":
+        assert set(quarters.tolist()) == {0.0, 1.0, 2.0, 3.0}
+    else:
+        assert torch.histc(quarters, 8, 0, 4).min() > 25
 
 
 def test_the_centre_crop_commutes_with_quarter_turns():

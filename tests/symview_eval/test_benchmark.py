@@ -1,8 +1,9 @@
 import json
 
 import pytest
+import torch
 
-from symview_eval import benchmark, views_benchmark
+from symview_eval import benchmark, policy_benchmark, views_benchmark
 
 
 def test_experts_are_counted_per_task():
@@ -49,6 +50,40 @@ def test_the_views_benchmark_names_every_ratio(monkeypatch, capsys):
     assert stated | {f"{name}_ratio" for name in views_benchmark.VIEWS} <= set(results)
     assert results["offline_codec_share"] < 1
     assert all(value > 0 for value in results.values())
+
+
+def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
+    monkeypatch.setattr(
+        "sys.argv",
+        ["symview-benchmark", "policy", "--batch_size=2", "--width=16", "--crop_size=64", "--repeats=1", "--json"],
+    )
+    with pytest.raises(SystemExit) as end:
+        benchmark.main()
+    assert end.value.code == 0
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    stated = {
+        "train_step_ratio_escnn_fp32",
+        "train_step_ratio_plain",
+        "train_step_floor_s",
+        "inference_ratio_b1",
+        "inference_ms_b1",
+        "inference_ratio_b5",
+        "inference_ms_b5",
+        "plugin_import_s",
+        "construct_s",
+        "loader_share",
+    }
+    assert stated <= set(results)
+    assert all(value > 0 for value in results.values())
+    assert results["loader_share"] < 1
+
+
+def test_the_network_it_is_compared_with_computes_the_same():
+    config = policy_benchmark.PolicyBenchmark(width=16, crop_size=64)
+    policy = policy_benchmark._policy(config)
+    seen = policy_benchmark._input(config, policy, 3)
+    plain = policy_benchmark.PlainNetwork(policy.network.encoder)
+    torch.testing.assert_close(plain(*seen), policy.network.encoder(*seen).flatten(1))
 
 
 def test_batches_are_measured_on_any_device():

@@ -1,0 +1,223 @@
+"""What training and running the equivariant policy costs, beside escnn and an ordinary network of the same widths."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import Tensor, nn
+from torch.nn import functional
+from tqdm import tqdm
+
+from lerobot_policy_symview.configuration_symview_bc import CROP_SIZES, SymviewBcConfig
+from lerobot_policy_symview.encoders import ImageEncoder
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_symview import keys
+from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.cli import DatasetTarget
+from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+
+LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
+PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"
+LOADED_EPISODES = 4
+MARGIN = 24  # pixels that the random crop may choose among: the paper's 152 for 128
+
+
+@dataclass(frozen=True)
+class PolicyBenchmark:
+    """Training steps, inference, start and data loading of symview_bc on a CPU, as ratios of one run."""
+
+    batch_size: int = 128
+    """Samples per training step."""
+    width: int = 64
+    """Regular fields n of the network."""
+    crop_size: int = 128
+    """Pixels the network sees."""
+    repeats: int = 3
+    """Training steps of each network; medians are taken. Inference is repeated ten times as often."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "repeats"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.crop_size not in CROP_SIZES:
+            raise ValueError(f"--crop_size must be one of {CROP_SIZES}, got {self.crop_size}")
+
+
+class PlainNetwork(nn.Module):
+    """Ordinary convolutions of an encoder's expanded widths, with its filters as they are at the time.
+
+    Training it is what dense execution of the equivariant network would cost if expanding filters were free; running it
+    is the network with its filters expanded once.
+    """
+
+    def __init__(self, encoder: ImageEncoder):
+        super().__init__()
+        self.pooled = encoder.pooled
+        self.layers = nn.ModuleList()
+        for layer in encoder.layers:
+            with torch.no_grad():
+                weight, bias = layer.expanded()  # type: ignore[operator]
+            outputs, inputs = weight.shape[:2]
+            dense = nn.Conv2d(inputs, outputs, 3, padding=layer.padding)  # type: ignore[arg-type]
+            dense.load_state_dict({"weight": weight.reshape(outputs, inputs, 3, 3), "bias": bias})
+            self.layers.append(dense)
+
+    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
+        """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
+        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
+        features = torch.cat([picture, planes], dim=1)
+        for layer, pool in zip(self.layers, self.pooled, strict=True):
+            features = layer(features)
+            features = functional.relu(functional.max_pool2d(features, 2) if pool else features)
+        return features.flatten(1)
+
+
+def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
+    """Return seconds, ratios and limits; see README.md for what each name means."""
+    from lerobot_policy_symview.escnn_reference import EscnnEncoder
+
+    start = time.perf_counter()
+    policy = _policy(config)
+    construct = time.perf_counter() - start
+    encoder = policy.network.encoder
+    assert isinstance(encoder, ImageEncoder)
+    plain, escnn = PlainNetwork(encoder), EscnnEncoder(encoder, initialize=False)
+    for parameter in escnn.parameters():
+        nn.init.normal_(parameter, std=0.02)
+    networks: dict[str, nn.Module] = {"": encoder, "plain_": plain, "escnn_": escnn}
+    picture, state = _input(config, policy, config.batch_size)
+    steps = _medians(
+        {name: _training_step(network, picture, state) for name, network in networks.items()}, config.repeats, "step"
+    )
+    results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
+    results |= {
+        "train_step_ratio_escnn_fp32": steps[""] / steps["escnn_"],
+        "train_step_ratio_plain": steps[""] / steps["plain_"],
+        "train_step_floor_s": _dense_operations(plain, config) / _operations_per_second(),
+    }
+    networks = {"": encoder, "plain_": PlainNetwork(encoder)}
+    for batch in (1, 5):
+        seen = _input(config, policy, batch)
+        calls = {name: _inference(network.eval(), *seen) for name, network in networks.items()}
+        times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
+        results |= {
+            f"inference_ms_b{batch}": 1000 * times[""],
+            f"inference_ratio_b{batch}": times[""] / times["plain_"],
+        }
+    loading = _loading_seconds(config)
+    return results | {
+        "plugin_import_s": _plugin_import(),
+        "construct_s": construct,
+        "loader_s": loading,
+        "loader_share": loading / (loading + steps[""]),
+    }
+
+
+def _policy(config: PolicyBenchmark) -> SymviewBcPolicy:
+    settings = SymviewBcConfig(device="cpu", width=config.width, crop_size=config.crop_size)
+    settings.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),))}
+    return SymviewBcPolicy(settings)
+
+
+def _input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    size = config.crop_size
+    picture = torch.rand(batch, policy.config.channels, size, size, generator=generator)
+    return picture, torch.rand(batch, 2, generator=generator)
+
+
+def _training_step(network: nn.Module, picture: Tensor, state: Tensor) -> Callable[[], None]:
+    """Return a training step: least squares on the features, which any head costs next to nothing beside."""
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-5)
+
+    def step() -> None:
+        network.train()
+        network(picture, state).square().mean().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def _inference(network: nn.Module, picture: Tensor, state: Tensor) -> Callable[[], None]:
+    def run() -> None:
+        with torch.inference_mode():
+            network(picture, state)
+
+    return run
+
+
+def _medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str) -> dict[str, float]:
+    """Time all calls in turn, once unmeasured and then `repeats` times: median seconds."""
+    times: dict[str, list[float]] = {key: [] for key in calls}
+    for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
+        for key, call in calls.items():
+            start = time.perf_counter()
+            call()
+            if repeat:
+                times[key].append(time.perf_counter() - start)
+    return {key: statistics.median(values) for key, values in times.items()}
+
+
+def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
+    """Floating-point operations of a dense training step: three convolutions per layer, two for the first."""
+    side, total = config.crop_size, 0.0
+    for index, (layer, pool) in enumerate(zip(network.layers, network.pooled, strict=True)):
+        assert isinstance(layer, nn.Conv2d)
+        side += 2 * int(layer.padding[0]) - 2
+        total += 2 * layer.weight.numel() * side * side * (2 if index == 0 else 3)
+        side = side // 2 if pool else side
+    return total * config.batch_size
+
+
+def _operations_per_second(size: int = 1024, repeats: int = 5) -> float:
+    """Measure matrix products, the fastest arithmetic there is here."""
+    a, b = torch.rand(size, size), torch.rand(size, size)
+    return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
+
+
+def _plugin_import() -> float:
+    command = [sys.executable, "-c", PLUGIN]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  our own words
+    return float(done.stdout.split()[-1])
+
+
+def _loading_seconds(config: PolicyBenchmark) -> float:
+    """Return the time a batch takes LeRobot's loader in the training process, of a dataset that holds only views."""
+    from lerobot.datasets import LeRobotDataset
+
+    with tempfile.TemporaryDirectory() as folder:
+        recorded, views = Path(folder) / "recorded", Path(folder) / "views"
+        target = RecordedDataset("benchmark/recorded", recorded)
+        generate(GenerateConfig(target, env=RecordedEnv(), num_episodes=LOADED_EPISODES))
+        add_views(
+            AddViewsConfig(
+                DatasetTarget("benchmark/recorded", recorded),
+                new_repo_id="benchmark/views",
+                new_root=views,
+                size=config.crop_size + MARGIN,
+                keep=[],
+            )
+        )
+        dataset = LeRobotDataset("benchmark/views", root=views)
+        loader = torch.utils.data.DataLoader(
+            dataset,
+            batch_size=config.batch_size,
+            sampler=torch.utils.data.RandomSampler(dataset, num_samples=3 * config.batch_size, replacement=True),
+        )
+        times, start = [], time.perf_counter()
+        for _ in loader:
+            times.append(time.perf_counter() - start)
+            start = time.perf_counter()
+    return statistics.median(times)

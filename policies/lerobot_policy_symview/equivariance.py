@@ -1,0 +1,187 @@
+"""Checking that a policy is equivariant, from raw observation to the action that is sent to the robot.
+
+```python
+policy = SymviewBcPolicy.from_pretrained(folder)
+assert_equivariant(policy)
+```
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lerobot_policy_symview.augmentation import move_images
+from lerobot_policy_symview.configuration_symview_bc import LIFTING, SymviewBcConfig
+from lerobot_policy_symview.groups import PlanarGroup, make_group
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
+from lerobot_policy_symview.symmetry import Motion
+from lerobot_symview import keys
+from lerobot_symview.calibration import parse_workspace
+from lerobot_symview.placement import CameraSpec
+
+TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10, torch.bfloat16: 5e-2}
+LEAST_SCALE = 0.1
+Observation = dict[str, Tensor]
+
+
+def assert_equivariant(
+    policy: SymviewBcPolicy,
+    processors: tuple[Any, Any] | None = None,
+    observation: Observation | None = None,
+    camera: Literal["stays", "moves"] | None = None,
+    tolerance: float | None = None,
+) -> None:
+    """Raise an AssertionError unless the policy acts on moved scenes as on the scene itself, action moved along.
+
+    Every element of the policy's group that maps pixels onto pixels is tried; the plain network, which has no group, is
+    held to D4.
+
+    Args:
+        policy: what to check; its mode is left as it was.
+        processors: its pre- and postprocessor; by default those that its configuration makes.
+        observation: what an environment or dataset delivers, batched; by default `example_observation`.
+        camera: whether the camera moves with the scene; by default it stays, except for policies that lift its image
+            to points in space.
+        tolerance: of `equivariance_errors`; by default 1e-4 in float32, 1e-10 in float64, 0.05 under bf16 autocast.
+    """
+    if tolerance is None:
+        device = policy.action_center.device.type
+        reduced = torch.is_autocast_enabled(device)
+        tolerance = TOLERANCE[torch.get_autocast_dtype(device) if reduced else policy.action_center.dtype]
+    errors = equivariance_errors(policy, processors, observation, camera)
+    group = checked_group(policy.config)
+    violations = [
+        f"{describe(group, element)}: {error:.2g}"
+        for element, error in errors.items()
+        if is_exact(group, element) and not error <= tolerance
+    ]
+    if violations:
+        raise AssertionError(
+            f"the policy ({policy.config.method}) is not equivariant within {tolerance:g}: {'; '.join(violations)}"
+        )
+
+
+def equivariance_errors(
+    policy: SymviewBcPolicy,
+    processors: tuple[Any, Any] | None = None,
+    observation: Observation | None = None,
+    camera: Literal["stays", "moves"] | None = None,
+) -> dict[int, float]:
+    """Return, for every element of the group, how far the action on the moved scene is from the moved action.
+
+    It is the largest difference of any entry, relative to the entry's largest value or, if that is more, a tenth of its
+    range in the data. Elements that do not map pixels
+    onto pixels move images by interpolation, which alone makes a difference. Arguments as for `assert_equivariant`.
+    """
+    config = policy.config
+    preprocess, postprocess = processors or make_symview_bc_pre_post_processors(config)
+    raw = observation or example_observation(config, policy.action_center.dtype)
+    group = checked_group(config)
+    training = policy.training
+
+    def act(seen: Observation) -> Tensor:
+        action: Tensor = postprocess(policy.select_action(preprocess(dict(seen))))
+        return action
+
+    action = act(raw)
+    scale = torch.maximum(action.abs().amax(dim=0), LEAST_SCALE * policy.action_width.to(action))
+    for first, second in config.actions.pairs:
+        scale[first] = scale[second] = torch.maximum(scale[first], scale[second])
+    errors = {}
+    for element in range(1, group.size):
+        motion = Motion.of_element(group, element, action)
+        expected = config.actions.move(action, motion, absolute_yaw=False)
+        actual = act(move_observation(raw, config, group, element, camera))
+        errors[element] = float(((actual - expected).abs().amax(dim=0) / scale).max())
+    policy.train(training)
+    return errors
+
+
+def move_observation(
+    observation: Observation,
+    config: SymviewBcConfig,
+    group: PlanarGroup,
+    element: int,
+    camera: Literal["stays", "moves"] | None = None,
+) -> Observation:
+    """Return what is observed of the scene moved by an element about the workspace's centre."""
+    moved = dict(observation)
+    moved[keys.STATE] = config.states.move(
+        observation[keys.STATE], Motion.of_element(group, element, observation[keys.STATE]), absolute_yaw=True
+    )
+    lifted = config.encoder in LIFTING
+    if not lifted:
+        for key in filter(None, (config.color_key, config.height_key)):
+            if key in observation:
+                moved[key] = _move_pixels(observation[key], group, element)
+    if camera == "moves" or (camera is None and lifted):
+        key = keys.world_from_cam(config.camera)
+        pose = observation[key].double().view(-1, 4, 4).clone()
+        center = pose.new_tensor([*parse_workspace(config.workspace).center, 0.0])
+        turn = torch.eye(3, dtype=pose.dtype, device=pose.device)
+        turn[:2, :2] = torch.from_numpy(group.rotation()[element])
+        pose[:, :3, :3] = turn @ pose[:, :3, :3]  # a mirror image's camera axes are left-handed: so is what it sees
+        pose[:, :3, 3] = (pose[:, :3, 3] - center) @ turn.T + center
+        moved[key] = pose.flatten(1).to(observation[key].dtype)
+    return moved
+
+
+def example_observation(config: SymviewBcConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> Observation:
+    """Return random images of what the policy reads, a camera's calibration and gripper poses, the same each time."""
+    generator = torch.Generator().manual_seed(0)
+    placed = CameraSpec(name=config.camera).place(parse_workspace(config.workspace))
+    lifted = config.encoder in LIFTING
+    side = placed.height if lifted else 3 * config.crop_size // 2  # a square turned by 45 degrees needs 1.41
+    state = torch.rand(batch, len(config.state_symmetry), generator=generator, dtype=dtype) - 0.5
+    limits = {"x": (0.0, 0.3), "y": (0.0, 0.3), "z": (0.12, 0.15), "aperture": (0.5, 1.0)}
+    for i, entry in enumerate(config.state_symmetry):
+        center, extent = limits.get(entry, (0.0, 2.0))
+        state[:, i] = center + extent * state[:, i]
+    observation = {
+        config.color_key: _blotches(batch, 3, side, generator).to(dtype),
+        keys.STATE: state,
+    }
+    if config.modality == "rgbd" and config.height_key:
+        depth = _blotches(batch, 1, side, generator).to(dtype)
+        observation[config.height_key] = 0.7 + 0.2 * depth if not config.is_computed else 0.2 * depth
+    for name in {config.camera, config.seen_camera}:
+        for key, matrix in (
+            (keys.intrinsics(name), placed.intrinsics),
+            (keys.world_from_cam(name), placed.world_from_cam),
+        ):
+            observation[key] = torch.tensor(matrix, dtype=dtype).flatten().expand(batch, -1).clone()
+    return observation
+
+
+def _move_pixels(images: Tensor, group: PlanarGroup, element: int) -> Tensor:
+    if not is_exact(group, element):
+        return move_images(images, Motion.of_element(group, element, images.flatten(1)))
+    flipped = images.flip(-1) if group.flips(element) else images
+    return torch.rot90(flipped, 4 * (element % group.turns) // group.turns, (-2, -1))
+
+
+def _blotches(batch: int, channels: int, side: int, generator: torch.Generator) -> Tensor:
+    """Return smooth random images with values in [0, 1]."""
+    coarse = torch.rand(batch, channels, 8, 8, generator=generator)
+    return functional.interpolate(coarse, (side, side), mode="bilinear")
+
+
+def checked_group(config: SymviewBcConfig) -> PlanarGroup:
+    """Return the group a policy is held to."""
+    return make_group("D4" if config.group == "C1" else config.group)
+
+
+def is_exact(group: PlanarGroup, element: int) -> bool:
+    """Whether an element maps the pixels of a square image onto pixels."""
+    return 4 * (element % group.turns) % group.turns == 0
+
+
+def describe(group: PlanarGroup, element: int) -> str:
+    """Return such words as `mirrored, turned by 90 degrees`."""
+    mirrored = "mirrored, " if group.flips(element) else ""
+    return f"{mirrored}turned by {360 * (element % group.turns) / group.turns:g} degrees"

@@ -1,0 +1,27 @@
+"""The methods that the paper compares, each a setting of the policy's orthogonal options."""
+
+from __future__ import annotations
+
+from typing import Any
+
+EQUIVARIANT = {"encoder": "equivariant", "group": "D4", "camera_direction": False}
+REPROJECTED = EQUIVARIANT | {"view": "reproj", "modality": "rgbd", "gripper_input": "image"}
+PERSPECTIVE = EQUIVARIANT | {"view": "persp", "modality": "rgb", "gripper_input": "image"}
+SIDEVIEW = EQUIVARIANT | {"view": "side", "modality": "rgbd", "gripper_input": "vector"}
+RELAXED = {"encoder": "relaxed"}
+BROKEN = {"camera_direction": True}
+
+METHODS: dict[str, dict[str, Any]] = {
+    "reproj_equi": REPROJECTED,
+    "persp_equi": PERSPECTIVE,
+    "sideview_equi": SIDEVIEW,
+    "oracle_equi": REPROJECTED | {"view": "top"},
+    "sideview_nonequi": SIDEVIEW | {"encoder": "plain", "group": "C1"},
+    "voxel_equi": SIDEVIEW | {"encoder": "voxel"},
+    "point_cloud_equi": SIDEVIEW | {"encoder": "point_cloud"},
+    "reproj_equi_relaxed": REPROJECTED | RELAXED,
+    "reproj_equi_broken": REPROJECTED | BROKEN,
+    "persp_equi_relaxed": PERSPECTIVE | RELAXED,
+    "persp_equi_broken": PERSPECTIVE | BROKEN,
+}
+"""Tables 1 to 3. `persp_equi_broken`, with the direction to the camera, is what the paper proposes for RGB."""

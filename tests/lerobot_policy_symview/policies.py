@@ -1,0 +1,52 @@
+"""Policies small enough for tests, one for each method."""
+
+from typing import Any
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.equivariance import example_observation
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_symview import keys
+
+STATS = {
+    keys.ACTION: {
+        "min": torch.tensor([-0.05, -0.03, -0.05, -0.6, 0.0]),
+        "max": torch.tensor([0.04, 0.05, 0.05, 0.7, 1.0]),
+    }
+}
+
+
+def make_config(**options: Any) -> SymviewBcConfig:
+    config = SymviewBcConfig(device="cpu", **({"width": 16, "crop_size": 64} | options))
+    config.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(config.action_symmetry),))}
+    return config
+
+
+def make_policy(**options: Any) -> SymviewBcPolicy:
+    torch.manual_seed(0)
+    config = make_config(**options)
+    return SymviewBcPolicy(config, dataset_stats=STATS if len(config.action_symmetry) == 5 else None)
+
+
+def training_batch(config: SymviewBcConfig, batch: int = 4) -> dict[str, torch.Tensor]:
+    """An observation and actions of either sign, with nothing in common."""
+    generator = torch.Generator().manual_seed(1)
+    actions = torch.rand(batch, len(config.action_symmetry), generator=generator) - 0.5
+    return example_observation(config, batch=batch) | {keys.ACTION: 0.1 * actions}
+
+
+def take_training_steps(policy: SymviewBcPolicy, count: int = 3, rate: float = 1e-3) -> list[float]:
+    policy.train()
+    batch = training_batch(policy.config)
+    optimizer = torch.optim.Adam(policy.get_optim_params(), lr=rate)
+    losses = []
+    for _ in range(count):
+        loss, _ = policy.forward(dict(batch))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        policy.update()
+        losses.append(loss.item())
+    return losses

@@ -1,0 +1,170 @@
+"""Every method's policy, from raw observation to the action sent to the robot."""
+
+import pytest
+import torch
+from lerobot.policies.factory import make_pre_post_processors
+
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.equivariance import (
+    assert_equivariant,
+    checked_group,
+    equivariance_errors,
+    example_observation,
+    move_observation,
+)
+from lerobot_policy_symview.methods import METHODS
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
+from lerobot_policy_symview.symmetry import Motion
+from lerobot_symview import keys
+from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch
+
+BROKEN = [method for method in METHODS if method.endswith("_broken")]
+RELAXED = [method for method in METHODS if method.endswith("_relaxed")]
+NONEQUIVARIANT = ["sideview_nonequi"]
+EQUIVARIANT = [method for method in METHODS if method not in BROKEN + RELAXED + NONEQUIVARIANT]
+
+
+@pytest.mark.parametrize("method", EQUIVARIANT)
+def test_methods_are_equivariant_before_and_after_training_and_loading(method, tmp_path):
+    policy = make_policy(method=method)
+    assert_equivariant(policy)
+    take_training_steps(policy)
+    assert policy.training
+    assert_equivariant(policy)
+    assert policy.training
+    for part in (policy, *make_symview_bc_pre_post_processors(policy.config)):
+        part.save_pretrained(tmp_path)
+    loaded = SymviewBcPolicy.from_pretrained(tmp_path)
+    assert_equivariant(loaded, make_pre_post_processors(loaded.config, str(tmp_path)))
+    assert_equivariant(loaded.double(), tolerance=1e-10)
+
+
+@pytest.mark.parametrize("method", EQUIVARIANT)
+def test_the_training_loss_is_invariant(method):
+    """In training mode, where nothing is random: the crop leaves no choice, the points are drawn alike."""
+    policy = make_policy(method=method).double().train()
+    config = policy.config
+    batch = {key: value.double() for key, value in training_batch(config).items()}
+    if method not in ("voxel_equi", "point_cloud_equi"):
+        batch |= {key: image[..., :64, :64] for key, image in batch.items() if image.ndim == 4}
+    group = checked_group(config)
+
+    def losses(seen):
+        torch.manual_seed(0)
+        return policy.forward(seen, reduction="none")[0]
+
+    expected = losses(dict(batch))
+    for element in range(1, group.size):
+        motion = Motion.of_element(group, element, batch[keys.ACTION])
+        moved = move_observation(batch, config, group, element)
+        moved[keys.ACTION] = config.actions.move(batch[keys.ACTION], motion, absolute_yaw=False)
+        torch.testing.assert_close(losses(moved), expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", NONEQUIVARIANT)
+def test_the_plain_network_is_not_equivariant(method):
+    policy = make_policy(method=method)
+    take_training_steps(policy)
+    assert min(equivariance_errors(policy).values()) > 0.05
+    with pytest.raises(AssertionError, match=r"sideview_nonequi.*not equivariant within 0.0001: turned by 90 degrees"):
+        assert_equivariant(policy)
+
+
+@pytest.mark.parametrize("method", RELAXED)
+def test_relaxed_networks_are_equivariant_until_training_relaxes_them(method):
+    policy = make_policy(method=method)
+    assert_equivariant(policy)
+    take_training_steps(policy, rate=1e-2)
+    assert max(equivariance_errors(policy).values()) > 1e-3
+
+
+@pytest.mark.parametrize("method", BROKEN)
+def test_the_direction_to_the_camera_breaks_the_symmetry_unless_the_camera_moves_along(method):
+    policy = make_policy(method=method)
+    take_training_steps(policy)
+    assert_equivariant(policy, camera="moves")
+    with pytest.raises(AssertionError, match="not equivariant"):
+        assert_equivariant(policy)
+    errors = equivariance_errors(policy)
+    assert errors[4] < 1e-4  # the camera stands in the mirror's plane y = 0
+    assert min(error for element, error in errors.items() if element != 4) > 0.01
+
+
+@pytest.mark.parametrize("group", ["C4", "D8", "C8"])
+def test_other_groups_are_exact_where_pixels_fall_on_pixels(group):
+    policy = make_policy(group=group)
+    take_training_steps(policy)
+    assert_equivariant(policy)
+    errors = equivariance_errors(policy)
+    assert len(errors) == {"C4": 3, "D8": 15, "C8": 7}[group]
+    assert all(error > 1e-3 for element, error in errors.items() if group != "C4" and element % 2)
+
+
+def test_reduced_precision_is_equivariant_as_far_as_it_is_precise():
+    policy = make_policy()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert 1e-4 < max(equivariance_errors(policy).values()) < 5e-2
+        assert_equivariant(policy)
+
+
+def test_scaling_x_and_y_apart_breaks_equivariance():
+    policy = make_policy()
+    policy.action_width[0] *= 2
+    with pytest.raises(AssertionError, match="turned by 90 degrees"):
+        assert_equivariant(policy)
+
+
+def test_normalising_x_and_y_apart_in_the_processors_breaks_equivariance():
+    policy = make_policy()
+    preprocessor, postprocessor = make_symview_bc_pre_post_processors(policy.config)
+
+    def stretch(action):
+        return postprocessor(action) * torch.tensor([1.5, 1.0, 1.0, 1.0, 1.0])
+
+    with pytest.raises(AssertionError, match="turned by 90 degrees"):
+        assert_equivariant(policy, (preprocessor, stretch))
+
+
+def test_the_papers_text_turns_yaw_the_wrong_way_in_a_mirror():
+    errors = equivariance_errors(make_policy(theta_representation="trivial"))
+    assert max(errors[element] for element in (1, 2, 3)) < 1e-4
+    assert min(errors[element] for element in (4, 5, 6, 7)) > 0.5
+
+
+def test_another_robot_needs_only_another_declaration():
+    """Seven entries in another order, with a rotation vector; the state has no gripper pose of ours."""
+    policy = make_policy(
+        action_symmetry=["aperture", "ry", "yaw", "y", "z", "x", "rx"],
+        state_symmetry=["scalar", "y:wrist", "x:wrist", "z", "sign"],
+        gripper_input="vector",
+    )
+    take_training_steps(policy)
+    assert_equivariant(policy)
+    wrong = make_policy(
+        action_symmetry=["aperture", "ry", "yaw", "x", "z", "y", "rx"],
+        state_symmetry=policy.config.state_symmetry,
+        gripper_input="vector",
+    )
+    wrong.load_state_dict(policy.state_dict())
+    wrong.config.action_symmetry = policy.config.action_symmetry
+    with pytest.raises(AssertionError):
+        assert_equivariant(wrong)
+
+
+def test_an_observation_is_moved_and_moved_back():
+    config = make_config(method="reproj_equi_broken")
+    group = checked_group(config)
+    raw = example_observation(config, torch.float64)
+    for element in range(group.size):
+        there = move_observation(raw, config, group, element, camera="moves")
+        back = move_observation(there, config, group, int(group.inverse[element]), camera="moves")
+        for key, value in raw.items():
+            difference = back[key] - value
+            if key == keys.STATE:
+                difference[:, 3] = torch.sin(difference[:, 3])
+            torch.testing.assert_close(difference, torch.zeros_like(difference))
+
+
+def test_methods_are_held_to_the_group_they_are_built_for():
+    assert checked_group(SymviewBcConfig(device="cpu", method="sideview_nonequi")).size == 8
