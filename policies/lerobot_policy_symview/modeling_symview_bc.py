@@ -23,7 +23,7 @@ from lerobot_policy_symview.state_input import StateInput, camera_directions
 from lerobot_policy_symview.symmetry import Motion, Symmetry
 from lerobot_policy_symview.voxels import voxelize
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_workspace
+from lerobot_symview.calibration import parse_calibration, parse_workspace
 from lerobot_symview.gripper import gripper_image
 from lerobot_symview.views import ReprojectedView
 
@@ -136,7 +136,7 @@ class SymviewBcPolicy(PreTrainedPolicy):
         state = batch[keys.STATE]
         direction = None
         if self.config.camera_direction:
-            direction = camera_directions(batch[keys.world_from_cam(self.config.camera)], self.workspace)
+            direction = camera_directions(self._calibration(batch)[1], self.workspace)
         picture = self._points(batch, motion) if self.config.encoder in LIFTING else self._images(batch)
         if motion is not None:
             state = self.config.states.move(state, motion, absolute_yaw=True)
@@ -172,8 +172,7 @@ class SymviewBcPolicy(PreTrainedPolicy):
         cloud = cloud_from_depth(
             batch[keys.rgb(camera)],
             metres(batch[keys.depth(camera)]),
-            batch[keys.intrinsics(camera)],
-            batch[keys.world_from_cam(camera)],
+            *self._calibration(batch),
             self.workspace,
             (gripper_z - view.clip_margin).clamp(min=view.clip_floor),
         )
@@ -182,6 +181,21 @@ class SymviewBcPolicy(PreTrainedPolicy):
         if self.config.encoder == "voxel":
             return voxelize(cloud, self.workspace)
         return cloud.sample(POINTS, shuffle=self.training)
+
+    def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """K (B, 9) and pose (B, 16) of the camera: the observation's own, or the ones stated for a camera without."""
+        names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
+        if all(name in batch for name in names):
+            return batch[names[0]], batch[names[1]]
+        if not self.config.calibration:
+            raise KeyError(f"the method {self.config.method!r} needs {names}, the observation has {sorted(batch)}")
+        stated = parse_calibration(self.config.calibration).camera(self.config.camera)
+        state = batch[keys.STATE]
+        k, pose = (
+            torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
+            for matrix in (stated.intrinsics, stated.world_from_cam)
+        )
+        return k, pose
 
     def _gripper(self, state: Tensor, pixels: int) -> Tensor:
         """Draw the gripper (B, pixels, pixels)."""

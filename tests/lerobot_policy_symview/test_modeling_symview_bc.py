@@ -147,6 +147,24 @@ def test_reduced_precision_acts_nearly_alike():
     assert 0 < (actual - expected).abs().max() < 0.1 * expected.abs().max()
 
 
+@pytest.mark.parametrize("method", ["voxel_equi", "reproj_equi_broken"])
+def test_the_camera_may_be_stated_in_place_of_observed(method):
+    policy = make_policy(method=method)
+    raw = example_observation(policy.config)
+    expected = act(policy, raw)
+    k, pose = (raw.pop(key)[0] for key in (keys.intrinsics("side"), keys.world_from_cam("side")))
+    with pytest.raises(KeyError, match="needs .*intrinsics"):
+        act(policy, raw)
+    side = {
+        "height": 152,
+        "width": 152,
+        "intrinsics": k.view(3, 3).tolist(),
+        "world_from_cam": pose.view(4, 4).tolist(),
+    }
+    policy.config.calibration = {"units": "m", "cameras": {"side": side}}
+    torch.testing.assert_close(act(policy, raw), expected, rtol=1e-4, atol=1e-6)
+
+
 def test_a_stated_option_wins_over_the_methods():
     config = SymviewBcConfig(device="cpu", method="sideview_equi", modality="rgb", encoder="plain")
     assert (config.view, config.modality, config.encoder, config.group) == ("side", "rgb", "plain", "C1")
