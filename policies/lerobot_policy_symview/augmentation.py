@@ -1,4 +1,4 @@
-"""Transformations of training: moving scenes about the workspace centre, and cropping."""
+"""Transformations of images: moving scenes about the workspace centre, scaling and cropping."""
 
 from __future__ import annotations
 
@@ -34,6 +34,15 @@ def move_images(images: Tensor, motion: Motion) -> Tensor:
     theta = torch.stack([torch.stack([sign * cos, -sign * sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
     grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
     return functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+
+
+def scale_down(images: Tensor, size: int) -> Tensor:
+    """Average images (B, C, H, W) over areas so that their shorter side has `size` pixels; smaller ones stay."""
+    height, width = images.shape[-2:]
+    shorter = min(height, width)
+    if shorter <= size:
+        return images
+    return functional.interpolate(images, (height * size // shorter, width * size // shorter), mode="area")
 
 
 def center_crop(images: Tensor, size: int) -> Tensor:

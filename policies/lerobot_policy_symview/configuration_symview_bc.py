@@ -71,7 +71,9 @@ class SymviewBcConfig(PreTrainedConfig):
     width: int = 64
     """Regular fields n of the network; 64 gives the paper's 1.1 M parameters."""
     crop_size: int = 128
-    """Pixels the network sees; a random crop in training, the middle in evaluation."""
+    """Pixels the network sees, 128 or 64: of images scaled down to 152 or 76, a random part in training, the middle in
+    evaluation.
+    """
     theta_representation: ThetaRepresentation = "sign"
     """`sign`: yaw increments change sign in a mirror; `trivial`: the paper's text."""
     relaxation_weight: float = 1e-4
@@ -182,6 +184,11 @@ class SymviewBcConfig(PreTrainedConfig):
             return keys.depth(self.seen_camera)
         height = f"{self.view}_height"
         return keys.view(self.camera, height) if height in self._made_view().outputs else None
+
+    @property
+    def image_size(self) -> int:
+        """Pixels of the shorter side that larger images are scaled down to; the paper's 152 for a crop of 128."""
+        return self.crop_size * 152 // 128
 
     @property
     def computed_views(self) -> dict[str, dict[str, Any]]:

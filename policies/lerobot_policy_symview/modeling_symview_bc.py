@@ -10,7 +10,7 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 
-from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion
+from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion, scale_down
 from lerobot_policy_symview.clouds import cloud_from_depth
 from lerobot_policy_symview.configuration_symview_bc import LIFTING, SymviewBcConfig
 from lerobot_policy_symview.encoders import ENCODERS
@@ -155,7 +155,7 @@ class SymviewBcPolicy(PreTrainedPolicy):
         """Colour in [0, 1] and, for `rgbd`, height relative to the working volume (a camera's own depth in metres)."""
         color = batch[self.config.color_key]
         if self.config.modality == "rgb":
-            return color
+            return scale_down(color, self.config.image_size)
         assert self.config.height_key is not None
         height = metres(batch[self.config.height_key])
         if self.config.view == "top":  # from straight above, depth is the camera's height less the surface's
@@ -163,7 +163,7 @@ class SymviewBcPolicy(PreTrainedPolicy):
             height = camera_height[:, None, None, None] - height
         if self.config.view != "side":
             height = height / self.workspace.height_limit
-        return torch.cat([color, height], dim=1)
+        return scale_down(torch.cat([color, height], dim=1), self.config.image_size)
 
     def _points(self, batch: dict[str, Tensor], motion: Motion | None) -> Tensor:
         """The camera's image lifted to space, as voxels (B, 4, Z, X, Y) or as points (B, P, 6)."""

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion
+from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion, scale_down
 from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.symmetry import Motion, Symmetry
 from lerobot_symview.gripper import gripper_image
@@ -54,6 +54,18 @@ def test_random_motions_reach_all_they_may_and_nothing_else(augmentation):
 def test_the_centre_crop_commutes_with_quarter_turns():
     turned = center_crop(torch.rot90(IMAGES, 1, (-2, -1)), 8)
     torch.testing.assert_close(turned, torch.rot90(center_crop(IMAGES, 8), 1, (-2, -1)))
+
+
+def test_larger_images_are_averaged_and_smaller_ones_stay():
+    torch.testing.assert_close(scale_down(IMAGES, 6), IMAGES.unfold(2, 2, 2).unfold(3, 2, 2).mean((-2, -1)))
+    assert scale_down(IMAGES, 12) is IMAGES
+    assert scale_down(IMAGES[..., :9, :], 6).shape[-2:] == (6, 8)
+
+
+@pytest.mark.parametrize("size", [5, 7, 11])
+def test_scaling_commutes_with_quarter_turns_and_mirror_images(size):
+    moved = torch.rot90(IMAGES, 1, (-2, -1)).flip(-1)
+    torch.testing.assert_close(scale_down(moved, size), torch.rot90(scale_down(IMAGES, size), 1, (-2, -1)).flip(-1))
 
 
 def test_random_crops_are_windows_of_their_images():

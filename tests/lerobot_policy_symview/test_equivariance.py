@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from lerobot.configs.types import NormalizationMode
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
@@ -75,7 +76,7 @@ def test_the_plain_network_is_not_equivariant(method):
 def test_relaxed_networks_are_equivariant_until_training_relaxes_them(method):
     policy = make_policy(method=method)
     assert_equivariant(policy)
-    take_training_steps(policy, rate=1e-2)
+    take_training_steps(policy, count=20)
     assert max(equivariance_errors(policy).values()) > 1e-3
 
 
@@ -103,8 +104,9 @@ def test_other_groups_are_exact_where_pixels_fall_on_pixels(group):
 
 def test_reduced_precision_is_equivariant_as_far_as_it_is_precise():
     policy = make_policy()
+    take_training_steps(policy)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert 1e-4 < max(equivariance_errors(policy).values()) < 5e-2
+        assert max(equivariance_errors(policy).values()) < 5e-2
         assert_equivariant(policy)
 
 
@@ -115,15 +117,15 @@ def test_scaling_x_and_y_apart_breaks_equivariance():
         assert_equivariant(policy)
 
 
-def test_normalising_x_and_y_apart_in_the_processors_breaks_equivariance():
+@pytest.mark.parametrize("mode", [NormalizationMode.MEAN_STD, NormalizationMode.MIN_MAX])
+def test_lerobots_own_normalisation_of_actions_breaks_equivariance(mode):
+    """Every entry by its own statistics: what the policy's configuration keeps LeRobot from doing."""
     policy = make_policy()
-    preprocessor, postprocessor = make_symview_bc_pre_post_processors(policy.config)
-
-    def stretch(action):
-        return postprocessor(action) * torch.tensor([1.5, 1.0, 1.0, 1.0, 1.0])
-
+    policy.config.normalization_mapping["ACTION"] = mode
+    scale = torch.tensor([0.03, 0.02, 0.03, 0.4, 0.5])
+    stats = {keys.ACTION: {"mean": torch.zeros(5), "std": scale, "min": -scale, "max": scale}}
     with pytest.raises(AssertionError, match="turned by 90 degrees"):
-        assert_equivariant(policy, (preprocessor, stretch))
+        assert_equivariant(policy, make_symview_bc_pre_post_processors(policy.config, stats))
 
 
 def test_the_papers_text_turns_yaw_the_wrong_way_in_a_mirror():

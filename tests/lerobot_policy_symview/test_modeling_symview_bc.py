@@ -153,7 +153,7 @@ def test_the_camera_may_be_stated_in_place_of_observed(method):
     raw = example_observation(policy.config)
     expected = act(policy, raw)
     k, pose = (raw.pop(key)[0] for key in (keys.intrinsics("side"), keys.world_from_cam("side")))
-    with pytest.raises(KeyError, match="needs .*intrinsics"):
+    with pytest.raises(KeyError, match=r"needs .*intrinsics"):
         act(policy, raw)
     side = {
         "height": 152,
