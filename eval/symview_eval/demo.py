@@ -81,6 +81,7 @@ def stages(config: DemoConfig) -> list[Stage]:
         "--policy.width=16",
         "--policy.crop_size=64",
         "--policy.learning_rate_decay=cosine",
+        "--policy.weight_averaging=0.99",
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
         f"--steps={config.steps}",

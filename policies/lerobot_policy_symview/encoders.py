@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.encoder import Encoder
+from lerobot_policy_symview.fourier_conv import FourierConv2d
 from lerobot_policy_symview.groups import PlanarGroup, block_diagonal
 from lerobot_policy_symview.layers import FieldConv2d, FieldConv3d, RelaxedConv2d
 from lerobot_policy_symview.point_encoder import PointEncoder
@@ -116,7 +117,7 @@ def _full(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, pa
 
 def _equivariant(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     fields = (2 * config.width, config.width, config.width)
-    return ImageEncoder(group, config.channels, state, _stages(config), fields)
+    return ImageEncoder(group, config.channels, state, _stages(config), fields, FourierConv2d)
 
 
 def _relaxed(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:

@@ -8,6 +8,7 @@ construction: the filter of output block g is the one of the identity, transform
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -86,21 +87,22 @@ class FieldLayer(nn.Module):
         self.weight = nn.Parameter(torch.empty(fields, channels, layers * basis.shape[1]))
         nn.init.normal_(self.weight, std=math.sqrt(2 / free))  # He et al. (2015): the basis is orthonormal
         self.bias = nn.Parameter(torch.zeros(fields))
-        self._expanded: tuple[Any, Tensor, Tensor] | None = None
+        self._kept: tuple[Any, tuple[Tensor, ...]] | None = None
 
-    def expanded(self) -> tuple[Tensor, Tensor]:
-        """Return ordinary weights (G fields, channels, layers, taps) and biases (G fields,).
+    def expanded(self) -> tuple[Tensor, ...]:
+        """Return ordinary weights (G fields, channels, layers, taps) and biases (G fields,)."""
+        return self.kept(self._expand)
 
-        Outside of training they are kept until the free weights change.
-        """
+    def kept(self, compute: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """Return what is computed from the weights; outside of training it is kept until these change."""
         if torch.is_grad_enabled():
-            self._expanded = None
-            return self._expand()
-        dtype = autocast_dtype(self.weight)
-        state = (self.weight._version, self.bias._version, self.weight.data_ptr(), self.bias.data_ptr(), dtype)
-        if self._expanded is None or self._expanded[0] != state:
-            self._expanded = (state, *self._expand())
-        return self._expanded[1:]
+            self._kept = None
+            return compute()
+        versions = [(parameter._version, parameter.data_ptr()) for parameter in self.parameters()]
+        state = (compute.__name__, versions, autocast_dtype(self.weight))
+        if self._kept is None or self._kept[0] != state:
+            self._kept = (state, compute())
+        return self._kept[1]
 
     def _expand(self) -> tuple[Tensor, Tensor]:
         dtype = autocast_dtype(self.weight)
