@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lerobot_symview.views import register_view as register_view
     from lerobot_symview.workspace import Workspace as Workspace
 
-# Loaded when they are asked for: views need numba, which takes longer to import than a simulator does, without views.
+# Loaded when they are asked for: views need OpenCV, which a simulator's process can do without.
 _HOMES = {
     "camera": ("CalibrationError", "Camera"),
     "placement": ("CameraSpec",),

@@ -7,7 +7,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-INFILLS = ("nearest", "local", "none")
 LOCAL_WINDOW = 5  # pixels, side of the neighbourhood that `local` infill averages
 NOWHERE = 1 << 15  # rows away: farther than any image is large
 

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.camera import Camera, depth_in_metres
-from lerobot_symview.gripper import gripper_picture
-from lerobot_symview.infill import INFILLS, fill_local, nearest_known
 from lerobot_symview.names import lookup
 from lerobot_symview.perspective import warp_map, warp_plane
-from lerobot_symview.upsampling import enlarge_depth
 from lerobot_symview.workspace import Workspace
-from lerobot_symview.zbuffer import EMPTY, gather, zbuffer_from_depth
+
+INFILLS = ("nearest", "local", "none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,18 +160,20 @@ class ReprojectedView:
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the outputs; where nothing is known, black and 0."""
+        from lerobot_symview import infill, upsampling, zbuffer  # numba takes a second, and a plugin must load fast
+
         if frame.depth is None:
             raise ValueError("the view 'reproj' needs depth; for a camera without it use 'persp'")
         depth, camera, rgb = depth_in_metres(frame.depth), frame.camera, frame.rgb
         if self.source_scale > 1:
-            depth, camera = enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
+            depth, camera = upsampling.enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
             rgb = rgb.repeat(self.source_scale, axis=0).repeat(self.source_scale, axis=1)
-        buffer = zbuffer_from_depth([depth], [camera], frame.workspace, self.size, self.ceiling(_height(frame)))
-        seen = buffer.source != EMPTY
-        shown = nearest_known(seen) if self.infill == "nearest" else _every_cell(self.size)
-        colors, height = gather(shown, buffer, rgb.reshape(-1, 3))
+        buffer = zbuffer.zbuffer_from_depth([depth], [camera], frame.workspace, self.size, self.ceiling(_height(frame)))
+        seen = buffer.source != zbuffer.EMPTY
+        shown = infill.nearest_known(seen) if self.infill == "nearest" else _every_cell(self.size)
+        colors, height = zbuffer.gather(shown, buffer, rgb.reshape(-1, 3))
         if self.infill == "local":
-            colors, height = fill_local(colors, seen), fill_local(height, seen)
+            colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)
         images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
         if self.mask:
             images["reproj_seen"] = _three_channels(seen.astype(np.uint8) * np.uint8(255))
@@ -240,6 +240,8 @@ class PerspectiveView:
         if self.gripper:
             if frame.gripper is None:
                 raise ValueError("the gripper image needs the gripper's state; without it, gripper=false")
+            from lerobot_symview.gripper import gripper_picture  # for the same reason
+
             images["persp_gripper"] = _three_channels(gripper_picture(frame.gripper, frame.workspace, self.size))
         return images
 

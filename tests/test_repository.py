@@ -47,3 +47,10 @@ def test_public_names_are_there_and_simulators_start_without_numba():
     assert all(getattr(lerobot_symview, name) is not None for name in dir(lerobot_symview))
     check = "import sys, symview_sim.env; sys.exit('numba' in sys.modules or 'lerobot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
+
+
+def test_the_plugin_loads_without_what_only_networks_views_and_simulators_need():
+    slow = "{'numba', 'escnn', 'pybullet', 'symview_sim', 'lerobot_policy_symview.modeling_symview_bc'}"
+    check = f"import sys, lerobot_policy_symview; sys.exit(', '.join({slow} & set(sys.modules)) or 0)"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

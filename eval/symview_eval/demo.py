@@ -29,9 +29,9 @@ class DemoConfig:
 
     output_dir: Path = Path("outputs/demo")
     """Folder for everything; a second run continues what an interrupted one left."""
-    demonstrations: int = 100
+    demonstrations: int = 20
     """How many expert episodes to learn from."""
-    steps: int = 1500
+    steps: int = 1200
     """Training steps."""
     batch_size: int = 16
     """Frames per training step."""

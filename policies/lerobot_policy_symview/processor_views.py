@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,10 +13,12 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_symview import keys
-from lerobot_symview.batched import FrameBatch, can_batch, render_batch
 from lerobot_symview.calibration import parse_calibration, parse_workspace
 from lerobot_symview.camera import CalibrationError, Camera, stored_camera
 from lerobot_symview.views import Frame, View, make_view
+
+if TYPE_CHECKING:
+    from lerobot_symview.batched import FrameBatch
 
 METRES_AT_MOST = 10.0
 
@@ -92,6 +94,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
     def _batch(
         self, observation: RobotObservation, views: list[str], needs_depth: bool, needs_gripper: bool
     ) -> FrameBatch:
+        from lerobot_symview.batched import FrameBatch  # needs numba, which a plugin's import must not wait for
+
         color, depth = keys.rgb(self.camera), keys.depth(self.camera)
         needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if needs_gripper else [])
         matrices = [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
@@ -126,6 +130,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """Return each output for all frames, on their device: together on a GPU, by the compiled kernels elsewhere."""
+    from lerobot_symview.batched import can_batch, render_batch
+
     device = batch.rgb.device
     if device.type != "cpu" and can_batch(view):
         return render_batch(view, batch)

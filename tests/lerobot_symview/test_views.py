@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from lerobot_symview.camera import Camera
-from lerobot_symview.infill import INFILLS
-from lerobot_symview.views import VIEWS, Frame, make_view, register_view
+from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view, register_view
 from lerobot_symview.workspace import Workspace
 from tests.conftest import make_camera
 from tests.lerobot_symview.test_upsampling import plane_depth
