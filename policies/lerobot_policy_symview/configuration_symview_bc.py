@@ -144,6 +144,11 @@ class SymviewBcConfig(PreTrainedConfig):
             )
         if self.is_computed and self.modality == "rgbd" and self.height_key is None:
             raise ValueError(f"the view {self.view!r} has no height; use --policy.modality=rgb")
+        if self.view == "side" and self.gripper_input == "image":
+            raise ValueError(
+                "--policy.gripper_input=image draws the gripper as seen from above, which --policy.view=side is not: "
+                "use --policy.gripper_input=vector, or --policy.method=sideview_equi for both"
+            )
         roles = {"image": keys.STATE_NAMES, "vector": (), "none": ()}[self.gripper_input]
         missing = [kind for kind in roles if kind not in self.state_symmetry]
         if missing:

@@ -130,6 +130,7 @@ def test_the_head_has_the_papers_parameter_count():
         ({"method": "sideview_nonequi", "group": "D4"}, "the plain encoder has the group C1"),
         ({"method": "voxel_equi", "group": "D8"}, "use --policy.group=D4"),
         ({"encoder": "voxel"}, "use --policy.view=side"),
+        ({"view": "side"}, "or --policy.method=sideview_equi"),
         ({"state_symmetry": ["x", "y", "z"]}, "lacks .'yaw', 'aperture'.: use --policy.gripper_input=vector"),
     ],
 )
