@@ -50,7 +50,6 @@ def stages(config: DemoConfig) -> list[Stage]:
     """Return the five commands of the pipeline."""
     folder = config.output_dir
     recorded, views, policy, evaluation = (folder / name for name in ("recorded", "views", "policy", "evaluation"))
-    checkpoint = policy / "checkpoints" / "last" / "pretrained_model"
     generate = (
         "symview-generate",
         f"--dataset.repo_id={REPO_ID}",
@@ -72,12 +71,24 @@ def stages(config: DemoConfig) -> list[Stage]:
         f"--size={VIEW_SIZE}",
         "--keep=[]",
     )
-    train = (
+    train = train_command(config, VIEWS_REPO_ID, views, policy, "--policy.view=reproj")
+    evaluate = evaluate_command(config, policy, evaluation)
+    return [
+        Stage("demonstrations", generate, recorded),
+        Stage("views", add_views, views),
+        Stage("training", train, policy),
+        Stage("evaluation", evaluate, evaluation),
+    ]
+
+
+def train_command(config: DemoConfig, repo_id: str, dataset: Path, output: Path, *options: str) -> tuple[str, ...]:
+    """Return how the demo trains a policy: small, on a CPU; `options` say which."""
+    return (
         "lerobot-train",
-        f"--dataset.repo_id={VIEWS_REPO_ID}",
-        f"--dataset.root={views}",
+        f"--dataset.repo_id={repo_id}",
+        f"--dataset.root={dataset}",
         "--policy.type=symview_bc",
-        "--policy.view=reproj",
+        *options,
         "--policy.width=16",
         "--policy.crop_size=64",
         "--policy.learning_rate_decay=cosine",
@@ -91,25 +102,23 @@ def stages(config: DemoConfig) -> list[Stage]:
         f"--save_freq={config.steps}",
         "--env_eval_freq=0",
         f"--seed={config.seed}",
-        f"--output_dir={policy}",
+        f"--output_dir={output}",
     )
-    evaluate = (
+
+
+def evaluate_command(config: DemoConfig, policy: Path, output: Path) -> tuple[str, ...]:
+    """Return how the demo evaluates what `train_command` left in the folder `policy`."""
+    return (
         "lerobot-eval",
-        f"--policy.path={checkpoint}",
+        f"--policy.path={policy / 'checkpoints' / 'last' / 'pretrained_model'}",
         "--policy.device=cpu",
         "--env.type=symview",
         f"--env.task={TASK}",
         f"--eval.n_episodes={config.eval_episodes}",
         f"--eval.batch_size={min(config.eval_episodes, 10)}",
         "--eval.use_async_envs=false",
-        f"--output_dir={evaluation}",
+        f"--output_dir={output}",
     )
-    return [
-        Stage("demonstrations", generate, recorded),
-        Stage("views", add_views, views),
-        Stage("training", train, policy),
-        Stage("evaluation", evaluate, evaluation),
-    ]
 
 
 def demo(config: DemoConfig) -> Path:

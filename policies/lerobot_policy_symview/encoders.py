@@ -5,7 +5,7 @@ The plain network is the equivariant one's layout for the group of one element.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -21,10 +21,39 @@ from lerobot_policy_symview.layers import FieldConv2d, FieldConv3d, RelaxedConv2
 from lerobot_policy_symview.point_encoder import PointEncoder
 from lerobot_policy_symview.voxels import VOXEL_CHANNELS
 
+CHANNELS_LAST = {2: torch.channels_last, 3: torch.channels_last_3d}
 Convolution = Callable[[PlanarGroup, int | NDArray[np.float64], int, int], nn.Module]
 
 
-class ImageEncoder(Encoder):
+class ConvolutionalEncoder(Encoder):
+    """Convolutions, some followed by the maximum of 2 pixels along every axis, each by ReLU, down to one pixel.
+
+    Args:
+        group: G elements.
+        fields: n.
+        layers: the convolutions; with a second argument True they append maximum and ReLU.
+        pooled: which of them do.
+    """
+
+    def __init__(self, group: PlanarGroup, fields: int, layers: Sequence[nn.Module], pooled: Sequence[bool]):
+        super().__init__(group, fields)
+        self.layers, self.pooled = nn.ModuleList(layers), list(pooled)
+
+    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
+        """Map pictures (B, C, size, size), or voxels (B, C, Z, X, Y), and states (B, D) to features (B, G, n)."""
+        shape = picture.shape[2:]
+        constants = state.reshape(*state.shape, *[1] * len(shape)).expand(-1, -1, *shape)
+        features = torch.cat([picture, constants], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
+            features = features.contiguous(memory_format=CHANNELS_LAST[len(shape)])
+        for layer, pool in zip(self.layers, self.pooled, strict=True):
+            features = layer(features, pool)
+            if not pool:
+                features = functional.relu(features)
+        return self.split(features)
+
+
+class ImageEncoder(ConvolutionalEncoder):
     """Seven convolutions from 128 px to one, six from 64 px (paper A.4; 1,112,680 parameters for five channels).
 
     Args:
@@ -45,29 +74,16 @@ class ImageEncoder(Encoder):
         fields: tuple[int, int, int],
         convolution: Convolution = FieldConv2d,
     ):
-        super().__init__(group, fields[-1])
         inputs: list[int | NDArray[np.float64]] = [scalars(group, channels, state), *stages, *fields[:-1]]
         paddings = [1] * (len(stages) + 1) + [0, 0]
-        self.layers = nn.ModuleList(
+        layers = [
             convolution(group, before, after, padding)
             for before, after, padding in zip(inputs, [*stages, *fields], paddings, strict=True)
-        )
-        self.pooled = [True] * len(stages) + [False, True, False]
-
-    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Map pictures (B, C, crop, crop) and states (B, D) to features (B, G, n)."""
-        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
-        features = torch.cat([picture, planes], dim=1)
-        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
-            features = features.contiguous(memory_format=torch.channels_last)
-        for layer, pool in zip(self.layers, self.pooled, strict=True):
-            features = layer(features, pool)
-            if not pool:
-                features = functional.relu(features)
-        return self.split(features)
+        ]
+        super().__init__(group, fields[-1], layers, [True] * len(stages) + [False, True, False])
 
 
-class VoxelEncoder(Encoder):
+class VoxelEncoder(ConvolutionalEncoder):
     """The image encoder in three dimensions, for 32 x 64 x 64 voxels; turns and mirrors move the last two axes.
 
     Args:
@@ -77,28 +93,15 @@ class VoxelEncoder(Encoder):
     """
 
     def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
-        super().__init__(group, width // 2)
         fields = [width // 16, width // 8, width // 4, width // 2, width, width // 2, width // 2]
         inputs: list[int | NDArray[np.float64]] = [scalars(group, VOXEL_CHANNELS, state), *fields[:-1]]
         paddings = [(1, 1, 1)] * 5 + [(1, 0, 0), (0, 0, 0)]
         heights = [3] * 6 + [2]
-        self.layers = nn.ModuleList(
+        layers = [
             FieldConv3d(group, before, after, padding, height)
             for before, after, padding, height in zip(inputs, fields, paddings, heights, strict=True)
-        )
-        self.pooled = [True, True, True, False, False, True, False]
-
-    def forward(self, voxels: Tensor, state: Tensor) -> Tensor:
-        """Map voxels (B, C, 32, 64, 64) and states (B, D) to features (B, G, n / 2)."""
-        blocks = state[:, :, None, None, None].expand(-1, -1, *voxels.shape[-3:])
-        features = torch.cat([voxels, blocks], dim=1)
-        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
-            features = features.contiguous(memory_format=torch.channels_last_3d)
-        for layer, pool in zip(self.layers, self.pooled, strict=True):
-            features = layer(features, pool)
-            if not pool:
-                features = functional.relu(features)
-        return self.split(features)
+        ]
+        super().__init__(group, fields[-1], layers, [True, True, True, False, False, True, False])
 
 
 def scalars(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
