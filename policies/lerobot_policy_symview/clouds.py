@@ -36,9 +36,10 @@ class Cloud:
         Without `shuffle` the choice is the same for every image of one size. A scene of fewer points repeats them, one
         of none has them all at its centre.
         """
-        rank = torch.rand(self.valid.shape, generator=None if shuffle else torch.Generator().manual_seed(0)).to(
-            self.valid.device
-        )
+        if shuffle:
+            rank = torch.rand(self.valid.shape, device=self.valid.device)
+        else:
+            rank = torch.rand(self.valid.shape[1], generator=torch.Generator().manual_seed(0)).to(self.valid.device)
         order = torch.where(self.valid, rank, 2.0).argsort(dim=1)
         available = self.valid.sum(dim=1, keepdim=True).clamp(min=1)
         chosen = order.gather(1, torch.arange(count, device=order.device)[None] % available)
