@@ -130,10 +130,9 @@ def test_expanded_filters_are_kept_until_weights_change():
 @pytest.mark.parametrize("channels", [5, 2])
 def test_our_encoder_computes_what_escnn_computes(channels):
     state = np.ones((8, 1, 1))
+    torch.set_default_dtype(torch.float32)  # escnn shares its bases among networks: in float64 they would break others
     encoder = ImageEncoder(D4, channels - 1, state, [2, 4], (4, 3, 2))
-    torch.set_default_dtype(torch.float32)  # escnn builds its bases in no other
-    reference = EscnnEncoder(encoder, initialize=False).double()
-    torch.set_default_dtype(torch.float64)
+    reference = EscnnEncoder(encoder, initialize=False)
     for parameter in reference.parameters():
         torch.nn.init.normal_(parameter)
     reference.eval()
@@ -142,4 +141,4 @@ def test_our_encoder_computes_what_escnn_computes(channels):
     picture, scalar = torch.randn(2, channels - 1, 32, 32), torch.randn(2, 1)
     with torch.no_grad():
         expected = reference(picture, scalar)
-        torch.testing.assert_close(encoder(picture, scalar), expected, rtol=1e-5, atol=1e-5 * expected.abs().max())
+        torch.testing.assert_close(encoder(picture, scalar), expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
