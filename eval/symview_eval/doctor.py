@@ -74,7 +74,7 @@ def check_torch() -> Finding:
 
 
 def check_escnn() -> Finding:
-    """The networks need escnn without the dependencies it cannot build here."""
+    """The benchmark compares with escnn, which must do without the dependencies it cannot build here."""
     from lerobot_policy_symview.escnn_import import gspaces
 
     space = gspaces.flipRot2dOnR2(4)

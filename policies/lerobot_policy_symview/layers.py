@@ -30,8 +30,7 @@ def steerable_basis(group: PlanarGroup) -> NDArray[np.float64]:
     The six are the centre pixel and a ring of radius 1 times cos and sin of 0, 1 and 2 times the angle. Function b of
     element g is b(g^-1 x); pixel x is (row, column) = (x, y) of the table.
     """
-    offset = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(TAPS, 2)
-    moved = np.einsum("gij,ti->gtj", group.rotation(), offset)  # g^-1 x, for an orthogonal g
+    moved = _moved_taps(group)
     radius, angle = np.hypot(moved[..., 0], moved[..., 1]), np.arctan2(moved[..., 1], moved[..., 0])
     ring = np.where(radius > 0.5, np.exp(-0.5 * ((radius - 1) / RING_WIDTH) ** 2), 0.0)
     waves = [np.cos(k * angle) for k in range(FREQUENCIES + 1)]
@@ -45,10 +44,14 @@ def pixel_basis(group: PlanarGroup) -> NDArray[np.float64]:
     """Return single pixels, moved by every element: (G, 9, 9). Filters may then be anything, as in plain networks."""
     if not group.is_exact:
         raise ValueError(f"pixels cannot be turned by {360 / group.turns:g} degrees")
-    offset = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(TAPS, 2)
-    moved = np.einsum("gij,ti->gtj", group.rotation(), offset).round().astype(int) + 1  # where each tap is read
-    source = 3 * moved[..., 0] + moved[..., 1]
-    return np.eye(TAPS)[:, source].transpose(1, 0, 2)
+    row, column = np.moveaxis(_moved_taps(group).round().astype(int) + 1, -1, 0)
+    return np.eye(TAPS)[:, 3 * row + column].transpose(1, 0, 2)
+
+
+def _moved_taps(group: PlanarGroup) -> NDArray[np.float64]:
+    """Return g^-1 x for every element g and pixel x of a filter: (G, 9, 2)."""
+    taps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(TAPS, 2)
+    return np.einsum("gij,ti->gtj", group.rotation(), taps)  # the inverse of an orthogonal matrix is its transpose
 
 
 class FieldLayer(nn.Module):
@@ -109,10 +112,9 @@ class FieldLayer(nn.Module):
         size, functions, taps = self.basis.shape
         weight = self.weight.to(dtype).view(self.fields, -1, self.layers, functions)
         if self.has_field_inputs:
-            blocks = weight.view(self.fields, size, -1, self.layers, functions)[
-                :, self.arrangement
-            ]  # (fields, G out, G in, inputs, ...)
-            arranged = blocks.transpose(0, 1).flatten(2, 3)
+            blocks = weight.view(self.fields, size, -1, self.layers, functions)
+            # (fields, G out, G in, inputs, ...), then the output's element first
+            arranged = blocks[:, self.arrangement].transpose(0, 1).flatten(2, 3)
         else:
             arranged = torch.einsum("oblf,gab->goalf", weight, self.arrangement.to(dtype))
         filters = torch.bmm(arranged.reshape(size, -1, functions), self.basis.to(dtype))

@@ -68,6 +68,8 @@ class SymviewBcPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config: SymviewBcConfig = config
         self.workspace = parse_workspace(config.workspace)
+        stated = parse_calibration(config.calibration) if config.calibration else None
+        self.stated_camera = stated.camera(config.camera) if stated else None
         self.inputs = StateInput(config, self.workspace)
         self.network = Network(config, self.inputs)
         self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
@@ -168,7 +170,8 @@ class SymviewBcPolicy(PreTrainedPolicy):
     def _points(self, batch: dict[str, Tensor], motion: Motion | None) -> Tensor:
         """The camera's image lifted to space, as voxels (B, 4, Z, X, Y) or as points (B, P, 6)."""
         camera, view = self.config.camera, ReprojectedView()
-        gripper_z = batch[keys.STATE][:, self.config.state_symmetry.index("z")]
+        state, entries = batch[keys.STATE], self.config.state_symmetry
+        gripper_z = state[:, entries.index("z")] if "z" in entries else state.new_full((len(state),), torch.inf)
         cloud = cloud_from_depth(
             batch[keys.rgb(camera)],
             metres(batch[keys.depth(camera)]),
@@ -187,10 +190,9 @@ class SymviewBcPolicy(PreTrainedPolicy):
         names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
         if all(name in batch for name in names):
             return batch[names[0]], batch[names[1]]
-        if not self.config.calibration:
+        if self.stated_camera is None:
             raise KeyError(f"the method {self.config.method!r} needs {names}, the observation has {sorted(batch)}")
-        stated = parse_calibration(self.config.calibration).camera(self.config.camera)
-        state = batch[keys.STATE]
+        state, stated = batch[keys.STATE], self.stated_camera
         k, pose = (
             torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
             for matrix in (stated.intrinsics, stated.world_from_cam)

@@ -32,7 +32,7 @@ def metres(depth: Tensor) -> Tensor:
     """
     if not depth.numel():
         return depth
-    return depth * torch.where(depth.abs().amax() > METRES_AT_MOST, 0.001, 1.0)  # no wait for a GPU's answer
+    return torch.where(depth.abs().amax() > METRES_AT_MOST, depth / 1000.0, depth)  # no wait for a GPU's answer
 
 
 @dataclass

@@ -34,6 +34,7 @@ def test_every_method_learns_one_batch(method):
         {"gripper_input": "none"},
         {"gripper_input": "vector"},
         {"modality": "rgb", "method": "oracle_equi"},
+        {"method": "point_cloud_equi", "state_symmetry": ["scalar", "sign"]},
         {"weight_averaging": 0.9},
     ],
     ids=str,
@@ -162,8 +163,8 @@ def test_the_camera_may_be_stated_in_place_of_observed(method):
         "intrinsics": k.view(3, 3).tolist(),
         "world_from_cam": pose.view(4, 4).tolist(),
     }
-    policy.config.calibration = {"units": "m", "cameras": {"side": side}}
-    torch.testing.assert_close(act(policy, raw), expected, rtol=1e-4, atol=1e-6)
+    told = make_policy(method=method, calibration={"units": "m", "cameras": {"side": side}})
+    torch.testing.assert_close(act(told, raw), expected, rtol=1e-4, atol=1e-6)
 
 
 def test_a_stated_option_wins_over_the_methods():
