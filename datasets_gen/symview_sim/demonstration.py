@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError
-from symview_sim.env import SymviewEnv
+from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
 
 ATTEMPTS = 10
@@ -71,15 +71,5 @@ def _attempt(env: SymviewEnv, seed: int, noise: float) -> list[dict[str, NDArray
             "next.done": np.array([done]),
             "next.success": np.array([info["is_success"]]),
         }
-        frames.append(_features(before) | outcome)
+        frames.append(named_features(before) | outcome)
     return frames if info["is_success"] else None
-
-
-def _features(observation: dict[str, Any]) -> dict[str, NDArray[Any]]:
-    """Name what was observed as LeRobot does."""
-    features = {keys.STATE: observation["agent_pos"]}
-    features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
-    for key in observation.keys() - {"agent_pos", "pixels"}:
-        value = observation[key]
-        features[f"observation.{key}"] = value[0, ..., None] if value.ndim == 3 else value  # depth: channel last
-    return features

@@ -178,6 +178,16 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return picture._replace(depth=degrade(picture.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
 
 
+def named_features(observation: Observation) -> dict[str, NDArray[Any]]:
+    """Name what was observed as LeRobot's datasets do, depth with its channel last."""
+    features = {keys.STATE: observation["agent_pos"]}
+    features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
+    for key in observation.keys() - {"agent_pos", "pixels"}:
+        value = observation[key]
+        features[f"observation.{key}"] = value[0, ..., None] if value.ndim == 3 else value
+    return features
+
+
 def _env_key(key: str) -> str:
     """Observation key that LeRobot turns into `key`, which it does by prefixing `observation.`."""
     return key.removeprefix("observation.")

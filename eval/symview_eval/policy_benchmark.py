@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from tqdm import tqdm
 
-from lerobot_policy_symview.configuration_symview_bc import CROP_SIZES, SymviewBcConfig
+from lerobot_policy_symview.configuration import CROP_SIZES
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.encoders import ImageEncoder
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys

@@ -5,7 +5,8 @@ configurations and the processor steps; networks and the simulator are imported 
 """
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.env_symview import SymviewEnvConfig
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
-__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "ViewsProcessorStep"]
+__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "SymviewSacfdConfig", "ViewsProcessorStep"]

@@ -45,19 +45,20 @@ def scale_down(images: Tensor, size: int) -> Tensor:
     return functional.interpolate(images, (height * size // shorter, width * size // shorter), mode="area")
 
 
-def center_crop(images: Tensor, size: int) -> Tensor:
-    """Return the middle size x size pixels of images (B, C, H, W)."""
-    top, left = (images.shape[-2] - size) // 2, (images.shape[-1] - size) // 2
-    return images[..., top : top + size, left : left + size]
+def crop(images: Tensor, size: int, place: Tensor | None = None) -> Tensor:
+    """Return size x size pixels of images (B, C, H, W).
 
-
-def random_crop(images: Tensor, size: int) -> Tensor:
-    """Return size x size pixels at a random place of each image of (B, C, H, W)."""
+    Args:
+        images: at least that large.
+        size: pixels.
+        place: (B, 2) in [0, 1), which of the possible rows and columns each part begins at; by default the middle one.
+    """
     batch, channels, height, width = images.shape
-    device = images.device
-    rows = torch.randint(height - size + 1, (batch, 1), device=device) + torch.arange(size, device=device)
-    columns = torch.randint(width - size + 1, (batch, 1), device=device) + torch.arange(size, device=device)
-    index = torch.arange(batch, device=device)[:, None, None, None]
-    return images[
-        index, torch.arange(channels, device=device)[:, None, None], rows[:, None, :, None], columns[:, None, None]
-    ]
+    if place is None:
+        top, left = (height - size) // 2, (width - size) // 2
+        return images[..., top : top + size, left : left + size]
+    corner = (place * place.new_tensor([height - size + 1, width - size + 1])).long()
+    rows, columns = (corner[..., None] + torch.arange(size, device=corner.device)).unbind(dim=1)
+    index = torch.arange(batch, device=corner.device)[:, None, None, None]
+    every = torch.arange(channels, device=corner.device)[:, None, None]
+    return images[index, every, rows[:, None, :, None], columns[:, None, None]]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.encoder import Encoder
 from lerobot_policy_symview.fourier_conv import FourierConv2d
 from lerobot_policy_symview.groups import PlanarGroup, block_diagonal
@@ -109,7 +109,7 @@ def scalars(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDAr
     return block_diagonal([np.ones((group.size, 1, 1))] * count + [others])
 
 
-def _stages(config: SymviewBcConfig) -> list[int]:
+def _stages(config: SymviewConfig) -> list[int]:
     n = config.width
     return {128: [n // 8, n // 4, n // 2, n], 64: [n // 4, n // 2, n]}[config.crop_size]
 
@@ -118,24 +118,24 @@ def _full(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, pa
     return FieldConv2d(group, inputs, fields, padding, full=True)
 
 
-def _equivariant(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def _equivariant(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     fields = (2 * config.width, config.width, config.width)
     return ImageEncoder(group, config.channels, state, _stages(config), fields, FourierConv2d)
 
 
-def _relaxed(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def _relaxed(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     fields = (2 * config.width, config.width, config.width)
     return ImageEncoder(group, config.channels, state, _stages(config), fields, RelaxedConv2d)
 
 
-def _plain(config: SymviewBcConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def _plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     """Return the lineage's 16, 32, 64, 128, 128, 256, 256 channels at the paper's size: 1.13 M parameters."""
     stages = [2 * fields for fields in _stages(config)]
     fields = (2 * config.width, 4 * config.width, 4 * config.width)
     return ImageEncoder(group, config.channels, state, stages, fields, _full)
 
 
-ENCODERS: dict[str, Callable[[SymviewBcConfig, PlanarGroup, NDArray[np.float64]], Encoder]] = {
+ENCODERS: dict[str, Callable[[SymviewConfig, PlanarGroup, NDArray[np.float64]], Encoder]] = {
     "equivariant": _equivariant,
     "plain": _plain,
     "relaxed": _relaxed,

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_policy_symview.augmentation import move_images
-from lerobot_policy_symview.configuration_symview_bc import LIFTING, SymviewBcConfig
+from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
 from lerobot_policy_symview.groups import PlanarGroup, make_group
-from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
+from lerobot_policy_symview.policy import SymviewPolicy
+from lerobot_policy_symview.processors import make_processors
 from lerobot_policy_symview.symmetry import Motion
 from lerobot_symview import keys
 from lerobot_symview.calibration import parse_workspace
@@ -30,7 +30,7 @@ Observation = dict[str, Tensor]
 
 
 def assert_equivariant(
-    policy: SymviewBcPolicy,
+    policy: SymviewPolicy,
     processors: tuple[Any, Any] | None = None,
     observation: Observation | None = None,
     camera: Literal["stays", "moves"] | None = None,
@@ -67,7 +67,7 @@ def assert_equivariant(
 
 
 def equivariance_errors(
-    policy: SymviewBcPolicy,
+    policy: SymviewPolicy,
     processors: tuple[Any, Any] | None = None,
     observation: Observation | None = None,
     camera: Literal["stays", "moves"] | None = None,
@@ -79,7 +79,7 @@ def equivariance_errors(
     onto pixels move images by interpolation, which alone makes a difference. Arguments as for `assert_equivariant`.
     """
     config = policy.config
-    preprocess, postprocess = processors or make_symview_bc_pre_post_processors(config)
+    preprocess, postprocess = processors or make_processors(config)
     raw = observation or example_observation(config, policy.action_center.dtype)
     group = checked_group(config)
     training = policy.training
@@ -104,7 +104,7 @@ def equivariance_errors(
 
 def move_observation(
     observation: Observation,
-    config: SymviewBcConfig,
+    config: SymviewConfig,
     group: PlanarGroup,
     element: int,
     camera: Literal["stays", "moves"] | None = None,
@@ -131,7 +131,7 @@ def move_observation(
     return moved
 
 
-def example_observation(config: SymviewBcConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> Observation:
+def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> Observation:
     """Return random images of what the policy reads, a camera's calibration and gripper poses, the same each time."""
     generator = torch.Generator().manual_seed(0)
     placed = CameraSpec(name=config.camera).place(parse_workspace(config.workspace))
@@ -171,7 +171,7 @@ def _blotches(batch: int, channels: int, side: int, generator: torch.Generator) 
     return functional.interpolate(coarse, (side, side), mode="bilinear")
 
 
-def checked_group(config: SymviewBcConfig) -> PlanarGroup:
+def checked_group(config: SymviewConfig) -> PlanarGroup:
     """Return the group a policy is held to."""
     return make_group("D4" if config.group == "C1" else config.group)
 

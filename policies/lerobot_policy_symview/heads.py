@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
+
+from lerobot_policy_symview.groups import block_diagonal
+
+LOG_STD_LIMITS = (-20.0, 2.0)  # Haarnoja et al. (2018)
 
 
 class EquivariantLinear(nn.Module):
@@ -51,3 +56,30 @@ class RegressionHead(EquivariantLinear):
     def loss(self, features: Tensor, action: Tensor) -> Tensor:
         """Return squared errors (B, A) of the scaled actions (B, A)."""
         return functional.mse_loss(self(features), action, reduction="none")
+
+
+class GaussianHead(nn.Module):
+    """A normal distribution of scaled actions: a mean that moves, and standard deviations that stay.
+
+    The two entries of a vector share one standard deviation, since a quarter turn exchanges them.
+
+    Args:
+        fields: n.
+        representation: (G, A, A), rho.
+        shared: which standard deviation each of the A entries has, counted from 0.
+    """
+
+    shared: Tensor
+
+    def __init__(self, fields: int, representation: NDArray[np.float64], shared: list[int]):
+        super().__init__()
+        self.actions = representation.shape[-1]
+        unmoved = np.ones((len(representation), 1, 1))
+        self.linear = EquivariantLinear(fields, block_diagonal([representation] + [unmoved] * len(set(shared))))
+        self.register_buffer("shared", torch.tensor(shared), persistent=False)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Map features (B, G, n) to means and logarithms of standard deviations, (B, A) each."""
+        values = self.linear(features)
+        log_std = values[:, self.actions :].clamp(*LOG_STD_LIMITS)
+        return values[:, : self.actions], log_std[:, self.shared]

@@ -200,6 +200,11 @@ class FieldLinear(FieldLayer):
         return functional.linear(features, weight.flatten(1), bias)
 
 
+def asymmetry(network: nn.Module) -> Tensor:
+    """Return how far the relaxed layers of a network are from equivariance."""
+    return torch.stack([layer.asymmetry() for layer in network.modules() if isinstance(layer, RelaxedConv2d)]).sum()
+
+
 def autocast_dtype(tensor: Tensor) -> torch.dtype:
     """Return the type that convolutions of `tensor` are computed in."""
     kind = tensor.device.type

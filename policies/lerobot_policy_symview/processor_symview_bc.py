@@ -1,36 +1,5 @@
-"""Pre- and postprocessing of the behaviour-cloning policy."""
+"""The processors of `symview_bc`, where LeRobot looks for them."""
 
-from __future__ import annotations
+from lerobot_policy_symview.processors import make_processors as make_symview_bc_pre_post_processors
 
-from typing import Any
-
-import torch
-from lerobot.processor import PolicyAction, PolicyProcessorPipeline
-from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
-
-from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
-from lerobot_policy_symview.processor_views import ViewsProcessorStep
-
-
-def make_symview_bc_pre_post_processors(
-    config: SymviewBcConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
-]:
-    """Return LeRobot's usual pipelines, with the policy's view computed where an observation lacks it."""
-    steps = make_default_policy_processor_steps(config, dataset_stats)
-    return make_policy_processor_pipelines(
-        input_steps=[
-            steps.rename_observations,
-            steps.add_batch_dim,
-            steps.to_device,
-            ViewsProcessorStep(
-                views=config.computed_views,
-                camera=config.camera,
-                workspace=config.workspace,
-                calibration=config.calibration,
-            ),
-            steps.normalize,
-        ],
-        output_steps=[steps.unnormalize, steps.to_cpu],
-    )
+__all__ = ["make_symview_bc_pre_post_processors"]

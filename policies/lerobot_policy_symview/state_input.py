@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.groups import PlanarGroup, block_diagonal
 from lerobot_symview import keys
 from lerobot_symview.workspace import Workspace
@@ -21,7 +21,7 @@ class StateInput:
         workspace: the scale of positions.
     """
 
-    def __init__(self, config: SymviewBcConfig, workspace: Workspace):
+    def __init__(self, config: SymviewConfig, workspace: Workspace):
         entries = config.state_symmetry
         wanted = {"image": ("z", "aperture"), "vector": ("x", "y", "z", "aperture"), "none": ("aperture",)}
         roles = wanted[config.gripper_input]

@@ -52,6 +52,10 @@ class Motion:
         angle = like.new_full((len(like),), group.angle(element))
         return cls(angle, torch.full_like(angle, group.flips(element), dtype=torch.bool))
 
+    def repeated(self, times: int) -> Motion:
+        """Return the motions of a batch that holds these samples several times over, one after the other."""
+        return Motion(self.angle.repeat(times), self.mirrored.repeat(times))
+
     @property
     def sign(self) -> Tensor:
         """(B,): -1 for mirrored samples, else 1."""
@@ -118,6 +122,14 @@ class Symmetry:
     def signs(self) -> list[int]:
         """Indices of the entries that mirror images negate."""
         return [i for i, entry in enumerate(self.entries) if entry.split(":")[0] in ("yaw", "sign")]
+
+    @cached_property
+    def shared_scales(self) -> list[int]:
+        """For every entry the number, from 0, of the scale it has: a vector's two entries have one in common."""
+        first_of = {second: first for first, second in self.pairs}
+        leaders = [first_of.get(i, i) for i in range(len(self.entries))]
+        order = sorted(set(leaders))
+        return [order.index(leader) for leader in leaders]
 
     def is_axial(self, index: int) -> bool:
         """Whether an entry is part of a rotation vector."""

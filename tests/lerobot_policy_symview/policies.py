@@ -5,9 +5,13 @@ from typing import Any
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 
+from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.equivariance import example_observation
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
+from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_symview import keys
 
 STATS = {
@@ -18,8 +22,8 @@ STATS = {
 }
 
 
-def make_config(**options: Any) -> SymviewBcConfig:
-    config = SymviewBcConfig(device="cpu", **({"width": 16, "crop_size": 64} | options))
+def make_config(kind: type[SymviewConfig] = SymviewBcConfig, **options: Any) -> Any:
+    config = kind(device="cpu", **({"width": 16, "crop_size": 64} | options))
     config.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(config.action_symmetry),))}
     return config
 
@@ -30,14 +34,19 @@ def make_policy(**options: Any) -> SymviewBcPolicy:
     return SymviewBcPolicy(config, dataset_stats=STATS if len(config.action_symmetry) == 5 else None)
 
 
-def training_batch(config: SymviewBcConfig, batch: int = 4) -> dict[str, torch.Tensor]:
+def make_actor(**options: Any) -> SymviewSacfdPolicy:
+    torch.manual_seed(0)
+    return SymviewSacfdPolicy(make_config(SymviewSacfdConfig, **options), dataset_stats=STATS)
+
+
+def training_batch(config: SymviewConfig, batch: int = 4) -> dict[str, torch.Tensor]:
     """An observation and actions of either sign, with nothing in common."""
     generator = torch.Generator().manual_seed(1)
     actions = torch.rand(batch, len(config.action_symmetry), generator=generator) - 0.5
     return example_observation(config, batch=batch) | {keys.ACTION: 0.1 * actions}
 
 
-def take_training_steps(policy: SymviewBcPolicy, count: int = 3, rate: float = 1e-3) -> list[float]:
+def take_training_steps(policy: SymviewPolicy, count: int = 3, rate: float = 1e-3) -> list[float]:
     policy.train()
     batch = training_batch(policy.config)
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=rate)

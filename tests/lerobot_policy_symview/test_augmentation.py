@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lerobot_policy_symview.augmentation import center_crop, move_images, random_crop, random_motion, scale_down
+from lerobot_policy_symview.augmentation import crop, move_images, random_motion, scale_down
 from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.symmetry import Motion, Symmetry
 from lerobot_symview.gripper import gripper_image
@@ -51,9 +51,9 @@ def test_random_motions_reach_all_they_may_and_nothing_else(augmentation):
         assert torch.histc(quarters, 8, 0, 4).min() > 25
 
 
-def test_the_centre_crop_commutes_with_quarter_turns():
-    turned = center_crop(torch.rot90(IMAGES, 1, (-2, -1)), 8)
-    torch.testing.assert_close(turned, torch.rot90(center_crop(IMAGES, 8), 1, (-2, -1)))
+def test_the_middle_commutes_with_quarter_turns():
+    turned = crop(torch.rot90(IMAGES, 1, (-2, -1)), 8)
+    torch.testing.assert_close(turned, torch.rot90(crop(IMAGES, 8), 1, (-2, -1)))
 
 
 def test_larger_images_are_averaged_and_smaller_ones_stay():
@@ -68,16 +68,17 @@ def test_scaling_commutes_with_quarter_turns_and_mirror_images(size):
     torch.testing.assert_close(scale_down(moved, size), torch.rot90(scale_down(IMAGES, size), 1, (-2, -1)).flip(-1))
 
 
-def test_random_crops_are_windows_of_their_images():
-    torch.manual_seed(0)
-    for crop in (random_crop(IMAGES, 5) for _ in range(10)):
-        assert crop.shape == (2, 3, 5, 5)
-        for image, window in zip(IMAGES, crop, strict=True):
-            windows = image.unfold(1, 5, 1).unfold(2, 5, 1)
-            assert (windows == window[:, None, None]).all(dim=(0, 3, 4)).any()
+def test_parts_begin_where_they_are_placed():
+    place = torch.tensor([[0.0, 0.0], [0.999, 0.5]])  # 8 possible rows and columns
+    parts = crop(IMAGES, 5, place)
+    torch.testing.assert_close(parts[0], IMAGES[0, :, :5, :5])
+    torch.testing.assert_close(parts[1], IMAGES[1, :, 7:, 4:9])
 
 
-def test_random_crops_reach_every_place():
+def test_every_place_is_as_likely():
     torch.manual_seed(0)
-    corners = {float(random_crop(IMAGES[:1], 11)[0, 0, 0, 0]) for _ in range(60)}
-    assert len(corners) == 4
+    images = torch.arange(144.0).view(1, 1, 12, 12).expand(900, -1, -1, -1)
+    corners = crop(images, 10, torch.rand(900, 2))[:, 0, 0, 0]
+    counts = corners.unique(return_counts=True)[1]
+    assert len(counts) == 9
+    assert counts.min() > 70

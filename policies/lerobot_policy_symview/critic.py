@@ -1,0 +1,62 @@
+"""What an action is worth: two estimates that stay the same when the scene and the action move together."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.encoders import ENCODERS
+from lerobot_policy_symview.groups import PlanarGroup, make_group
+from lerobot_policy_symview.layers import FieldLinear
+from lerobot_policy_symview.state_input import StateInput
+
+ESTIMATES = 2  # the smaller one is believed (Fujimoto et al., 2018)
+
+
+class DoubleQ(nn.Module):
+    """Two networks of one hidden layer on shared features: linear to n fields, ReLU, maximum over the group, linear.
+
+    Args:
+        group: G elements.
+        fields: n, of the features and of each hidden layer.
+        actions: (G, A, A), how scaled actions move.
+    """
+
+    def __init__(self, group: PlanarGroup, fields: int, actions: NDArray[np.float64]):
+        super().__init__()
+        self.group, self.fields = group, fields
+        self.from_features = FieldLinear(group, fields, ESTIMATES * fields)
+        self.from_action = FieldLinear(group, actions, ESTIMATES * fields)
+        self.weight = nn.Parameter(torch.empty(ESTIMATES, fields))
+        self.bias = nn.Parameter(torch.zeros(ESTIMATES))
+        nn.init.normal_(self.weight, std=1 / math.sqrt(fields))
+
+    def forward(self, features: Tensor, action: Tensor) -> Tensor:
+        """Map features (B, G, n) and scaled actions (B, A) to values (B, 2)."""
+        with torch.autocast(features.device.type, enabled=False):
+            features = features.to(self.weight.dtype)
+            hidden = self.from_features(features.flatten(1)) + self.from_action(action)
+            hidden = functional.relu(hidden).view(-1, self.group.size, ESTIMATES, self.fields).amax(dim=1)
+            return (hidden * self.weight).sum(dim=-1) + self.bias
+
+
+class Critic(nn.Module):
+    """An encoder of its own, and the two estimates on its features.
+
+    Args:
+        config: what to build, as for the actor.
+        inputs: the numbers beside the picture.
+    """
+
+    def __init__(self, config: SymviewConfig, inputs: StateInput):
+        super().__init__()
+        group = make_group(config.group)
+        self.encoder = ENCODERS[config.encoder](config, group, inputs.representation(group))
+        actions = config.actions.representation(group, config.theta_representation)
+        self.values = DoubleQ(group, self.encoder.fields, actions)

@@ -1,0 +1,271 @@
+"""`symview-train-rl` as a user runs it: learning, stopping, going on, and what LeRobot makes of its checkpoints."""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from lerobot.configs.default import WandBConfig
+from lerobot.scripts import lerobot_eval
+from safetensors.torch import load_file
+
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from lerobot_policy_symview.equivariance import assert_equivariant
+from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
+from lerobot_policy_symview.rl import train_rl as command
+from lerobot_policy_symview.rl.configuration import Demonstrations, TrainRlConfig
+from lerobot_policy_symview.rl.demonstrations import open_dataset, outcomes
+from lerobot_policy_symview.rl.learner import WEIGHTS
+from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.replay import ReplayConfig
+from lerobot_policy_symview.rl.train_rl import train_rl
+from lerobot_policy_symview.rl.training import Training
+from lerobot_symview import keys
+from lerobot_symview.cli import CommandError
+from symview_sim.settings import EnvSettings
+
+
+def make_config(recorded, folder, **options):
+    policy = SymviewSacfdConfig(device="cpu", width=16, crop_size=64, **options.pop("policy", {}))
+    stated = {"steps": 6, "batch_size": 8, "num_simulators": 2, "eval_every": 3, "eval_episodes": 3, "log_every": 2}
+    config = TrainRlConfig(
+        dataset=Demonstrations("test/recorded", recorded),
+        env=EnvSettings(max_steps=4),
+        policy=policy,
+        output_dir=folder,
+        save_every=100,
+    )
+    return replace(config, **stated | options)
+
+
+def state_of(checkpoint):
+    """Everything a checkpoint holds that another run of the same seed must hold too."""
+    weights = load_file(checkpoint / "pretrained_model" / "model.safetensors")
+    weights |= {f"learner.{name}": value for name, value in load_file(checkpoint / "training_state" / WEIGHTS).items()}
+    for name in ("actor", "critic", "temperature"):
+        optimizer = load_file(checkpoint / "training_state" / name / "optimizer_state.safetensors")
+        weights |= {f"{name}.{key}": value for key, value in optimizer.items()}
+    return weights, json.loads((checkpoint / "training_state" / "state.json").read_text())
+
+
+def assert_same_run(one, other):
+    (weights, state), (other_weights, other_state) = state_of(one), state_of(other)
+    assert weights.keys() == other_weights.keys()
+    assert [name for name in weights if not torch.equal(weights[name], other_weights[name])] == []
+    assert json.dumps(state) == json.dumps(other_state)  # nan is not equal to itself
+    for table in ("training.csv", "evaluation.csv"):
+        assert (one.parent.parent / table).read_bytes() == (other.parent.parent / table).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(recorded, tmp_path_factory):
+    """A run without interruption."""
+    return train_rl(make_config(recorded, tmp_path_factory.mktemp("rl") / "whole"))
+
+
+def test_a_run_leaves_tables_and_a_policy(whole):
+    folder = whole.parent.parent
+    training, evaluation = read_table(folder / "training.csv"), read_table(folder / "evaluation.csv")
+    assert [row["step"] for row in training] == [2, 4, 6]
+    assert [row["step"] for row in evaluation] == [3, 6]
+    assert sum(row["episodes"] for row in training) == 2  # of 4 actions, in 2 simulators
+    assert all(row["critic_loss"] > 0 for row in training)
+    assert (folder / "checkpoints" / "last").resolve() == whole
+    assert_equivariant(SymviewSacfdPolicy.from_pretrained(whole / "pretrained_model"))
+
+
+def test_lerobot_eval_finds_what_the_training_found(whole, recorded, monkeypatch, tmp_path):
+    """Same scenes, same policy: the same successes, from the checkpoint and LeRobot's own loop."""
+    config = make_config(recorded, whole.parent.parent)
+    with Training(config, open_dataset(config.dataset)) as training:
+        training.policy.load_state_dict(SymviewSacfdPolicy.from_pretrained(whole / "pretrained_model").state_dict())
+        found = training.evaluate()
+    argv = [
+        "lerobot-eval", f"--policy.path={whole / 'pretrained_model'}", "--env.type=symview", "--env.max_steps=4",
+        "--eval.n_episodes=3", "--eval.batch_size=1", f"--output_dir={tmp_path}", "--policy.device=cpu",
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", argv)
+    lerobot_eval.main()
+    overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]
+    assert overall["n_episodes"] == 3
+    assert overall["pc_success"] / 100 == pytest.approx(found.success_rate)
+
+
+def test_a_run_that_is_stopped_and_resumed_is_the_run_without_interruption(recorded, whole, tmp_path, monkeypatch):
+    """Ctrl-C in the middle of an episode and of a row of the log; resumed twice."""
+    real, steps = Training.joint_step, []
+
+    def joint_step(self):
+        real(self)
+        steps.append(self.step)
+        if len(steps) in (3, 5):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Training, "joint_step", joint_step)
+    config = make_config(recorded, tmp_path / "stopped")
+    with pytest.raises(KeyboardInterrupt):
+        train_rl(config)
+    with pytest.raises(KeyboardInterrupt):
+        train_rl(replace(config, resume=True))
+    last = train_rl(replace(config, resume=True))
+    assert steps == [1, 2, 3, 4, 5, 6]
+    assert_same_run(last, whole)
+    kept = [folder.name for folder in last.parent.iterdir() if (folder / "training_state" / "replay").is_dir()]
+    assert sorted(kept) == ["000006", "last"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupted_checkpoint_does_not_count(recorded, whole, tmp_path, monkeypatch):
+    """Killed while it writes the second checkpoint, a run goes on from the first."""
+    config = make_config(recorded, tmp_path / "killed", save_every=2)
+    real = command.save_checkpoint
+
+    def save_checkpoint(training, run_id):
+        if training.step == 4:
+            monkeypatch.setattr(training.replay, "save", lambda folder: 1 / 0)
+        return real(training, run_id)
+
+    monkeypatch.setattr(command, "save_checkpoint", save_checkpoint)
+    with pytest.raises(ZeroDivisionError):
+        train_rl(config)
+    monkeypatch.setattr(command, "save_checkpoint", real)
+    assert_same_run(train_rl(replace(config, resume=True)), whole)
+
+
+def test_frames_on_disk_are_the_same_frames(recorded, whole, tmp_path):
+    config = make_config(recorded, tmp_path / "disk", replay=ReplayConfig(memory_limit_gb=0.0))
+    checkpoint = train_rl(config)
+    assert (config.output_dir / "replay").is_dir()
+    assert_same_run(checkpoint, whole)
+
+
+def test_a_simulator_that_dies_costs_its_episode(recorded, tmp_path, monkeypatch, caplog):
+    real = Training.joint_step
+
+    def joint_step(self):
+        if self.step == 2:
+            os.kill(self._simulators.process_ids[1], signal.SIGKILL)
+            while self._simulators.is_alive(1):
+                pass
+        real(self)
+
+    monkeypatch.setattr(Training, "joint_step", joint_step)
+    train_rl(make_config(recorded, tmp_path / "died"))
+    rows = read_table(tmp_path / "died" / "training.csv")
+    assert [row["lost_episodes"] for row in rows] == [0, 1, 0]
+    assert sum(row["episodes"] for row in rows) == 1
+    assert "simulator 1 died (exit code -9)" in caplog.text
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_time_outs_are_followed_by_what_was_seen_last_unless_they_are_terminal(recorded, tmp_path, terminal):
+    config = make_config(recorded, tmp_path, policy={"timeouts_are_terminal": terminal})
+    with Training(config, open_dataset(config.dataset)) as training:
+        training.begin()
+        before = len(training.replay)
+        for _ in range(5):
+            training.joint_step()
+        replay = training.replay
+        first = replay.slots - 2 * (config.steps + config.steps // 4 + 2)
+        ends = replay._columns["terminal"][first : first + 6].tolist()
+        acted = (replay._columns["chance"][first : first + 6] > 0).tolist()
+        state = replay._frames[keys.STATE][first : first + 6]
+    assert len(replay) == before + 10
+    assert ends == [False, False, False, terminal, False, False]
+    assert acted == [True] * 4 + ([True, False] if terminal else [False, True])
+    assert abs(state[4] - state[0]).max() > 1e-3 or terminal
+
+
+def test_demonstrations_are_remembered_as_they_were_recorded(recorded, tmp_path):
+    config = make_config(recorded, tmp_path)
+    dataset = open_dataset(config.dataset)
+    reward, ends, succeeds = outcomes(dataset)
+    assert reward.sum() == ends.sum() == succeeds.sum() == 2
+    with Training(config, dataset) as training:
+        training.begin()
+        assert len(training.replay) == len(dataset)
+        columns, frames = training.replay._columns, training.replay._frames
+        for index in (0, 3, len(dataset) - 1):
+            assert (frames[keys.STATE][index] == dataset[index][keys.STATE].numpy()).all()
+            physical = training.policy.physical(torch.from_numpy(columns["action"][index]))
+            torch.testing.assert_close(physical, dataset[index][keys.ACTION], rtol=0, atol=1e-6)
+        assert columns["terminal"][: len(dataset)].tolist() == ends.tolist()
+        assert frames["observation.images.side_reproj"].shape[1:] == (3, 76, 76)
+
+
+def test_a_view_in_the_dataset_is_what_simulators_make(with_views, tmp_path):
+    """The dataset's first frame, made offline, is the first frame of a simulator with its seed."""
+    from symview_sim.demonstration import episode_seed
+    from symview_sim.simulators import Reset
+
+    config = make_config(with_views, tmp_path)
+    with Training(config, open_dataset(config.dataset)) as training:
+        training.begin()
+        training._simulators.send(0, Reset(episode_seed(0, 0)))
+        seen = training._simulators.receive(0).observation
+        packed = training._pack(seen)
+        for name, image in packed.items():
+            assert (training.replay._frames[name][0] == image).all()
+
+
+def test_weights_and_biases_gets_the_tables_without_a_network(recorded, tmp_path):
+    config = make_config(recorded, tmp_path / "run", wandb=WandBConfig(enable=True, mode="offline"))
+    checkpoint = train_rl(config)
+    (run,) = (tmp_path / "run" / "wandb").glob("offline-run-*/run-*.wandb")
+    assert b"train/critic_loss" in run.read_bytes()
+    assert json.loads((checkpoint / "training_state" / "state.json").read_text())["wandb_run_id"] in run.name
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "holds a training: use --resume=true"),
+        ({"resume": True, "seed": 3}, "begun with other flags: --seed is 3, was 0"),
+        ({"resume": True, "policy": {"learning_rate": 0.5}}, r"--policy.learning_rate is 0.5, was 0.001"),
+    ],
+    ids=str,
+)
+def test_an_output_folder_that_does_not_fit_is_refused(recorded, whole, options, message):
+    with pytest.raises(CommandError, match=message):
+        train_rl(make_config(recorded, whole.parent.parent, **options))
+
+
+def test_nothing_to_resume_and_nothing_to_learn_from_are_told(recorded, tmp_path):
+    with pytest.raises(CommandError, match=r"no checkpoint in .* to resume from: leave out --resume=true"):
+        train_rl(make_config(recorded, tmp_path / "empty", resume=True))
+    with pytest.raises(CommandError, match=r"there is no dataset in .*--dataset.root"):
+        train_rl(make_config(tmp_path / "nowhere", tmp_path / "empty"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "--steps must be at least 1, got 0"),
+        ({"seed": -1}, "--seed must not be negative"),
+        ({"policy": {"method": "oracle_equi"}}, "sees the camera top: use --env.oracle=true"),
+    ],
+    ids=str,
+)
+def test_wrong_flags_are_named(recorded, tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        make_config(recorded, tmp_path, **options)
+
+
+@pytest.mark.parametrize(
+    "options", [{"discount": 0.0}, {"target_rate": 1.5}, {"initial_temperature": 0.0}, {"target_interval": 0},
+                {"expert_weight": -1.0}, {"target_update": "soft"}], ids=str,
+)  # fmt: skip
+def test_wrong_options_of_the_policy_are_named(options):
+    with pytest.raises(ValueError, match=f"--policy.{next(iter(options))}"):
+        SymviewSacfdConfig(device="cpu", **options)
+
+
+def test_the_command_reports_a_mistake_in_one_line(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(sys, "argv", ["symview-train-rl", f"--dataset.root={tmp_path}", "--policy.method=reproj_equi"])
+    with pytest.raises(SystemExit) as end:
+        command.main()
+    assert end.value.code == 1
+    assert capsys.readouterr().err.startswith(f"symview-train-rl: error: there is no dataset in {tmp_path}")

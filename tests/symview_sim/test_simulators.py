@@ -1,0 +1,120 @@
+"""Simulators in processes of their own."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from lerobot_symview import keys
+from lerobot_symview.cli import CommandError
+from symview_sim.settings import EnvSettings
+from symview_sim.simulators import Observed, Reset, Simulators, Step
+
+NAMES = (keys.view("side", "reproj"), keys.view("side", "reproj_height"), keys.STATE)
+OBSERVED = Observed(EnvSettings(max_steps=3), NAMES, {"reproj": {"size": 76}})
+ACTIONS = np.random.default_rng(0).uniform(-0.05, 0.05, (20, 5)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def simulators():
+    with Simulators(OBSERVED, 2) as two:
+        yield two
+
+
+def run(simulators, index, command):
+    simulators.send(index, command)
+    return simulators.receive(index)
+
+
+def assert_same(actual, expected):
+    assert actual.keys() == expected.keys() == set(NAMES)
+    for name, value in expected.items():
+        np.testing.assert_array_equal(actual[name], value)
+
+
+def test_observations_are_what_the_environment_and_the_view_say(simulators):
+    from lerobot_symview.camera import stored_camera
+    from lerobot_symview.views import Frame, ReprojectedView
+    from lerobot_symview.workspace import Workspace
+    from symview_sim.env import named_features
+
+    outcome = run(simulators, 0, Reset(7))
+    env = OBSERVED.env.make()
+    raw = named_features(env.reset(seed=7)[0])
+    env.close()
+    camera = stored_camera(raw[keys.intrinsics("side")], raw[keys.world_from_cam("side")], 152, 152)
+    depth = raw[keys.depth("side")][..., 0]
+    made = ReprojectedView(size=76).render(Frame(raw[keys.rgb("side")], depth, camera, Workspace(), raw[keys.STATE]))
+    assert outcome.observation[NAMES[0]].dtype == np.uint8
+    np.testing.assert_array_equal(outcome.observation[NAMES[0]], made["reproj"])
+    np.testing.assert_array_equal(outcome.observation[NAMES[1]][..., 0], made["reproj_height"])
+    np.testing.assert_array_equal(outcome.observation[keys.STATE], raw[keys.STATE])
+
+
+def test_an_episode_that_ends_is_followed_by_the_next(simulators):
+    run(simulators, 0, Reset(1))
+    outcomes = [run(simulators, 0, Step(ACTIONS[i], next_seed=2)) for i in range(3)]
+    assert [outcome.last is not None for outcome in outcomes] == [False, False, True]
+    assert not any(outcome.terminated or outcome.success or outcome.lost for outcome in outcomes)
+    assert_same(outcomes[-1].observation, run(simulators, 1, Reset(2)).observation)
+    assert outcomes[-1].last[keys.STATE][0] != outcomes[-1].observation[keys.STATE][0]
+
+
+def test_without_a_next_seed_nothing_follows(simulators):
+    run(simulators, 0, Reset(1))
+    outcomes = [run(simulators, 0, Step(ACTIONS[i], next_seed=None)) for i in range(3)]
+    assert outcomes[-1].observation is None
+    assert outcomes[-1].last is not None
+
+
+def test_seed_and_actions_bring_a_simulator_to_the_same_place_whatever_it_did_before(simulators):
+    run(simulators, 0, Reset(3))
+    expected = [run(simulators, 0, Step(action, None)).observation for action in ACTIONS[:2]][-1]
+    run(simulators, 1, Reset(99))
+    run(simulators, 1, Step(ACTIONS[5], None))
+    assert_same(run(simulators, 1, Reset(3, tuple(ACTIONS[:2]))).observation, expected)
+
+
+@pytest.mark.parametrize("when", ["while waiting", "at work"])
+def test_a_simulator_that_dies_is_replaced_and_its_episode_lost(simulators, caplog, when):
+    run(simulators, 0, Reset(1))
+    run(simulators, 1, Reset(1))
+    before = simulators.process_ids
+    if when == "at work":
+        simulators.send(0, Step(ACTIONS[0], next_seed=5))
+    os.kill(before[0], signal.SIGKILL)
+    if when == "while waiting":
+        while simulators.is_alive(0):
+            pass
+        simulators.send(0, Step(ACTIONS[0], next_seed=5))
+    outcome = simulators.receive(0)
+    if when == "while waiting" or outcome.lost:  # at work it may have been faster than the signal
+        assert outcome.lost
+        assert "simulator 0 died (exit code -9)" in caplog.text
+        assert simulators.process_ids[0] != before[0]
+        assert_same(outcome.observation, run(simulators, 1, Reset(5)).observation)
+        assert not run(simulators, 0, Step(ACTIONS[0], next_seed=6)).lost
+    assert simulators.process_ids[1] == before[1]
+
+
+def test_one_that_always_dies_is_an_error():
+    broken = Observed(EnvSettings(), ("observation.images.nowhere",))
+    with Simulators(broken, 1) as one:
+        one.send(0, Reset(0))
+        with pytest.raises(CommandError, match="simulator 0 dies as soon as it is started"):
+            one.receive(0)
+
+
+def test_ctrl_c_is_left_to_the_process_that_trains(simulators):
+    run(simulators, 0, Reset(1))
+    os.kill(simulators.process_ids[0], signal.SIGINT)
+    assert not run(simulators, 0, Step(ACTIONS[0], None)).lost
+
+
+def test_closed_simulators_leave_no_process():
+    with Simulators(OBSERVED, 1) as one:
+        run(one, 0, Reset(0))
+        (process,) = one.process_ids
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
