@@ -129,7 +129,7 @@ class _Convolution(torch.autograd.Function):
             torch.bmm(square, square_inputs, out=square_outputs)
             collect(*buffers.products, biases, *block, plan.width, buffers.planes, plan.pool, target, which)
 
-        in_threads(work, chain.from_iterable(plan.blocks()), lambda: Buffers(plan))
+        in_threads(work, list(chain.from_iterable(plan.blocks())), lambda: Buffers(plan))
         ctx.save_for_backward(images, lines, square, chosen)
         ctx.plan, ctx.values = plan, values
         return out

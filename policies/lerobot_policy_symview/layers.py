@@ -113,8 +113,10 @@ class FieldLayer(nn.Module):
         weight = self.weight.to(dtype).view(self.fields, -1, self.layers, functions)
         if self.has_field_inputs:
             blocks = weight.view(self.fields, size, -1, self.layers, functions)
-            # (fields, G out, G in, inputs, ...), then the output's element first
-            arranged = blocks[:, self.arrangement].transpose(0, 1).flatten(2, 3)
+            # (fields, G out, G in, inputs, ...), then the output's element first; blocks[:, self.arrangement] would do,
+            # but sums its gradient in any order
+            chosen = blocks.index_select(1, self.arrangement.flatten()).unflatten(1, self.arrangement.shape)
+            arranged = chosen.transpose(0, 1).flatten(2, 3)
         else:
             arranged = torch.einsum("oblf,gab->goalf", weight, self.arrangement.to(dtype))
         filters = torch.bmm(arranged.reshape(size, -1, functions), self.basis.to(dtype))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import queue
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
@@ -26,22 +25,19 @@ os.register_at_fork(after_in_child=_workers.cache_clear)  # threads do not survi
 
 
 def in_threads[State, Task](
-    work: Callable[[State, Task], None], tasks: Iterable[Task], make: Callable[[], State]
+    work: Callable[[State, Task], None], tasks: Sequence[Task], make: Callable[[], State]
 ) -> list[State]:
-    """Call `work(state, task)` for every task, in as many threads as torch uses; return each thread's `make()`."""
-    todo: queue.SimpleQueue[Task] = queue.SimpleQueue()
-    for task in tasks:
-        todo.put(task)
-    count = min(torch.get_num_threads(), todo.qsize())
+    """Call `work(state, task)` for every task, in as many threads as torch uses; return each thread's `make()`.
 
-    def run(_: int) -> State:
+    Which thread has which task follows from their numbers alone, so that what a thread sums up is the same every time.
+    """
+    count = max(1, min(torch.get_num_threads(), len(tasks)))
+
+    def run(thread: int) -> State:
         with torch.inference_mode():
             state = make()
-            while True:
-                try:
-                    task = todo.get_nowait()
-                except queue.Empty:
-                    return state
+            for task in tasks[thread::count]:
                 work(state, task)
+            return state
 
-    return [run(0)] if count <= 1 else list(_workers(count).map(run, range(count)))
+    return [run(0)] if count == 1 else list(_workers(count).map(run, range(count)))

@@ -45,6 +45,20 @@ def test_every_option_trains(options):
     assert all(0 < loss < 100 for loss in losses)
 
 
+@pytest.mark.parametrize(
+    "method", ["reproj_equi", "sideview_nonequi", "voxel_equi", "point_cloud_equi", "reproj_equi_relaxed"]
+)
+def test_training_is_the_same_to_the_last_bit(method):
+    """Whichever of several threads is faster, which changes from run to run."""
+    runs = []
+    for _ in range(3):
+        policy = make_policy(method=method, augmentation="o2")
+        take_training_steps(policy, count=2)
+        runs.append(policy.state_dict())
+    for name, value in runs[0].items():
+        assert all(torch.equal(run[name], value) for run in runs[1:]), name
+
+
 def test_saved_and_loaded_policies_act_alike(tmp_path):
     policy = make_policy(weight_averaging=0.9)
     take_training_steps(policy)
