@@ -33,6 +33,11 @@ VIEW_SIZE = 76
 EPISODES = 2
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slowest tests, so that processes that share the rest end together."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""

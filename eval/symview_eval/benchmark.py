@@ -1,4 +1,4 @@
-"""`symview-benchmark`: what experts achieve, what a simulated step and a view cost, as tables or JSON."""
+"""`symview-benchmark`: what experts achieve, what a simulated step, a view and an update cost, as tables or JSON."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from lerobot_symview.cli import USAGE, run_command
 from lerobot_symview.names import lookup
 from symview_eval.clock import Clock
 from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
+from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
 from symview_sim.settings import EnvSettings
@@ -34,7 +35,8 @@ EXAMPLES = """\
   symview-benchmark experts --seeds=200
   symview-benchmark env --json=true
   symview-benchmark views
-  symview-benchmark policy --batch_size=32"""
+  symview-benchmark policy --batch_size=32
+  symview-benchmark rl --policy.width=16 --policy.crop_size=64 --batch_size=32"""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,7 @@ SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "env": (EnvBenchmark, benchmark_env),
     "views": (ViewsBenchmark, benchmark_views),
     "policy": (PolicyBenchmark, benchmark_policy),
+    "rl": (RlBenchmark, benchmark_rl),
 }
 
 

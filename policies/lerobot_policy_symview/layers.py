@@ -113,9 +113,9 @@ class FieldLayer(nn.Module):
         weight = self.weight.to(dtype).view(self.fields, -1, self.layers, functions)
         if self.has_field_inputs:
             blocks = weight.view(self.fields, size, -1, self.layers, functions)
-            # (fields, G out, G in, inputs, ...), then the output's element first; blocks[:, self.arrangement] would do,
-            # but sums its gradient in any order
-            chosen = blocks.index_select(1, self.arrangement.flatten()).unflatten(1, self.arrangement.shape)
+            # blocks[:, self.arrangement], but that sums its gradient in any order
+            chosen = blocks.index_select(1, self.arrangement.flatten()).view(self.fields, size, *blocks.shape[1:])
+            # (fields, G out, G in, inputs, ...), then the output's element first
             arranged = chosen.transpose(0, 1).flatten(2, 3)
         else:
             arranged = torch.einsum("oblf,gab->goalf", weight, self.arrangement.to(dtype))

@@ -3,7 +3,7 @@ import json
 import pytest
 import torch
 
-from symview_eval import benchmark, policy_benchmark, views_benchmark
+from symview_eval import benchmark, policy_benchmark, rl_benchmark, views_benchmark
 
 
 def test_experts_are_counted_per_task():
@@ -76,6 +76,22 @@ def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
     assert stated <= set(results)
     assert all(value > 0 for value in results.values())
     assert results["loader_share"] < 1
+
+
+def test_the_reinforcement_learning_benchmark_names_every_cost(monkeypatch, capsys):
+    monkeypatch.setattr(rl_benchmark, "DEMONSTRATIONS", 1)
+    argv = ["symview-benchmark", "rl", "--batch_size=4", "--num_simulators=2", "--rounds=1", "--json"]
+    monkeypatch.setattr("sys.argv", [*argv, "--policy.width=16", "--policy.crop_size=64"])
+    with pytest.raises(SystemExit) as end:
+        benchmark.main()
+    assert end.value.code == 0
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert {"joint_step_ratio", "sample_ms", "sample_floor_ms", "joint_step_s", "network_s", "simulation_s"} <= set(
+        results
+    )
+    assert results["bytes_per_transition"] == 76 * 76 * 5 + 20 + 20 + 4 + 1 + 8
+    assert all(value > 0 for value in results.values())
+    assert results["network_share"] + results["waiting_share"] < 1
 
 
 def test_the_network_it_is_compared_with_computes_the_same():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from torch.utils.data import DataLoader
 
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_symview.staging import plain
+from symview_sim.settings import EnvSettings
 
 BATCH = 32
 REWARD, SUCCESS = "next.reward", "next.success"
@@ -30,6 +33,29 @@ def open_dataset(target: DatasetTarget) -> Any:
     if not (folder / "meta" / "info.json").is_file():
         raise CommandError(f"there is no dataset in {folder}: use --dataset.root, or symview-generate to make one")
     return LeRobotDataset(target.repo_id, root=folder, depth_output_unit="m", video_backend="pyav")
+
+
+def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
+    """Compare what a dataset says about its task, robot and camera with what is to be simulated.
+
+    Raises:
+        ValueError: naming the flags that differ.
+    """
+    simulated = {spec.name: spec for spec in (env.camera, *env.more_cameras)}
+    if camera not in simulated:
+        raise ValueError(f"--policy.camera={camera} is not simulated; --env.camera.name is {env.camera.name!r}")
+    info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
+    recorded = info.get("symview", {})
+    flags = {"task": env.task, "robot": env.robot}
+    pairs = {f"--env.{name}": (value, recorded[name]) for name, value in flags.items() if name in recorded}
+    for name, value in plain(asdict(simulated[camera])).items():
+        if name in recorded.get("placement", {}):
+            pairs[f"--env.camera.{name}"] = (value, recorded["placement"][name])
+    differing = [
+        f"{flag} is {ours!r}, theirs is {theirs!r}" for flag, (ours, theirs) in pairs.items() if ours != theirs
+    ]
+    if differing:
+        raise ValueError(f"the demonstrations are of another scene: {'; '.join(differing)}")
 
 
 def observations(dataset: Any) -> Iterator[tuple[dict[str, Tensor], Tensor]]:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.processors import make_processors
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
-from lerobot_policy_symview.rl.demonstrations import observations, outcomes, ranges
+from lerobot_policy_symview.rl.demonstrations import check_scene, observations, outcomes, ranges
 from lerobot_policy_symview.rl.evaluation import Evaluation, evaluate
 from lerobot_policy_symview.rl.learner import Learner
 from lerobot_policy_symview.rl.replay import Frame, Replay
@@ -84,6 +84,7 @@ class Training:
 
     def __init__(self, config: TrainRlConfig, dataset: Any):
         self.config, self._dataset = config, dataset
+        check_scene(dataset, config.env, config.policy.camera)
         set_seed(config.seed)
         space: Any = config.env.make().action_space
         policy = deepcopy(config.policy)
@@ -94,7 +95,7 @@ class Training:
         self.policy.to(policy.device)
         self.processors = make_processors(policy)
         self.learner = Learner(self.policy)
-        self._observed = Observed(
+        self.observed = Observed(
             env=config.env,
             names=tuple(policy.network_keys),
             views=policy.computed_views,
@@ -102,7 +103,7 @@ class Training:
             workspace=policy.workspace,
         )
         self.replay = self._empty_replay()
-        self._simulators = Simulators(self._observed, config.num_simulators)
+        self._simulators = Simulators(self.observed, config.num_simulators)
         self._evaluators: Simulators | None = None
         self.step = 0
         self.episodes = [Episode(self._seed(i, 0)) for i in range(config.num_simulators)]
@@ -139,35 +140,29 @@ class Training:
     def joint_step(self) -> None:
         """Act in every simulator, and update the networks meanwhile."""
         start = time.perf_counter()
-        self.policy.eval()
-        with torch.no_grad(), self.policy.precision():
-            scaled, _ = self.policy.draw(*self.policy.network_input(self._batch))
-        actions = self._physical(scaled)
+        scaled, actions = self.act()
         for index, action in enumerate(actions):
             self._simulators.send(index, Step(action, self._seed(index, self.episodes_begun[index])))
-        self._learn()
+        self.learn()
         learned = time.perf_counter()
         received = [self._simulators.receive(index) for index in range(len(self.episodes))]
         waited = time.perf_counter()
-        self._take_in(scaled.cpu().numpy(), actions, received)
+        self._take_in(scaled, actions, received)
         self.step += 1
         self.seconds["network"] += learned - start
         self.seconds["waiting"] += waited - learned
         self.seconds["simulation"] += max(outcome.seconds for outcome in received)
         self.seconds["total"] += time.perf_counter() - start
 
-    def evaluate(self) -> Evaluation:
-        """Run the policy, without chance, on scenes that training does not see."""
-        if self._evaluators is None:
-            self._evaluators = Simulators(self._observed, self.config.num_simulators)
+    def act(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Draw an action for every simulator: scaled and in metres and radians, (simulators, A) each."""
+        self.policy.eval()
+        with torch.no_grad(), self.policy.precision():
+            scaled, _ = self.policy.draw(*self.policy.network_input(self._batch))
+        return scaled.cpu().numpy(), self._physical(scaled)
 
-        def act(seen: list[Observation]) -> NDArray[np.float32]:
-            return self.processors[1](self.policy.select_action(self._seen(seen))).numpy()
-
-        seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.config.eval_episodes)
-        return evaluate(act, self._evaluators, seeds, self.config.policy.discount)
-
-    def _learn(self) -> None:
+    def learn(self) -> None:
+        """Update the networks once, if enough is remembered."""
         if len(self.replay) < self.config.batch_size:
             return
         beta = self.config.replay.beta
@@ -176,6 +171,17 @@ class Training:
         errors, measures = self.learner.update(sample)
         self.replay.prioritise(sample.slots, errors)
         self.interval.add(measures)
+
+    def evaluate(self) -> Evaluation:
+        """Run the policy, without chance, on scenes that training does not see."""
+        if self._evaluators is None:
+            self._evaluators = Simulators(self.observed, self.config.num_simulators)
+
+        def act(seen: list[Observation]) -> NDArray[np.float32]:
+            return self.processors[1](self.policy.select_action(self._seen(seen))).numpy()
+
+        seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.config.eval_episodes)
+        return evaluate(act, self._evaluators, seeds, self.config.policy.discount)
 
     def _take_in(self, scaled: NDArray, actions: NDArray[np.float32], received: list[Outcome]) -> None:
         """Remember what came of the actions."""

@@ -25,6 +25,7 @@ from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError
+from lerobot_symview.placement import CameraSpec
 from symview_sim.settings import EnvSettings
 
 
@@ -252,6 +253,20 @@ def test_nothing_to_resume_and_nothing_to_learn_from_are_told(recorded, tmp_path
 def test_wrong_flags_are_named(recorded, tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
         make_config(recorded, tmp_path, **options)
+
+
+@pytest.mark.parametrize(
+    ("env", "policy", "message"),
+    [
+        (EnvSettings(task="drawer_opening"), {}, "--env.task is 'drawer_opening', theirs is 'block_picking'"),
+        (EnvSettings(camera=CameraSpec(elevation_deg=30)), {}, "--env.camera.elevation_deg is 30, theirs is 45"),
+        (EnvSettings(), {"camera": "left"}, "--policy.camera=left is not simulated; --env.camera.name is 'side'"),
+    ],
+    ids=str,
+)
+def test_demonstrations_of_another_scene_are_refused(recorded, tmp_path, env, policy, message):
+    with pytest.raises(ValueError, match=message):
+        train_rl(make_config(recorded, tmp_path, env=env, policy=policy))
 
 
 @pytest.mark.parametrize(
