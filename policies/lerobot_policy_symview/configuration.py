@@ -81,6 +81,10 @@ class SymviewConfig(PreTrainedConfig):
     """
     learning_rate: float = 1e-3
     """Of Adam."""
+    weight_averaging: float = 0.0
+    """Decay of an exponential average of the weights that acts in evaluation, such as 0.995; 0 for none, as in the
+    paper.
+    """
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of convolutions, in training and evaluation; bfloat16 is for GPUs and for processors that have it."""
     state_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
@@ -111,6 +115,8 @@ class SymviewConfig(PreTrainedConfig):
             self._check_choice(name, choices)
         if self.width < 16 or self.width % 16:
             raise ValueError(f"--policy.width must be a positive multiple of 16, got {self.width}")
+        if not 0 <= self.weight_averaging < 1:
+            raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
         self._check_combination()
         _ = self.actions, self.states  # declarations are checked when they are parsed
 
@@ -205,7 +211,7 @@ class SymviewConfig(PreTrainedConfig):
         """Name and options of the view to make where an observation lacks it, with no output that is not needed."""
         if not self.is_computed:
             return {}
-        needless = {"reproj": {"height": self.modality == "rgbd"}, "persp": {"gripper": False}}
+        needless = {"reproj": {"height": self.modality == "rgbd", "mask": False}, "persp": {"gripper": False}}
         return {self.view: self.view_options | needless.get(self.view, {})}
 
     @property

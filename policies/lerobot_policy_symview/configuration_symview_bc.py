@@ -19,16 +19,10 @@ class SymviewBcConfig(SymviewConfig):
 
     learning_rate_decay: Literal["none", "cosine"] = "none"
     """`cosine` lowers the rate to zero over the training, `none` keeps it, as in the paper."""
-    weight_averaging: float = 0.0
-    """Decay of an exponential average of the weights that acts in evaluation, such as 0.995; 0 for none, as in the
-    paper.
-    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_choice("learning_rate_decay", ("none", "cosine"))
-        if not 0 <= self.weight_averaging < 1:
-            raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """Return the schedule that `learning_rate_decay` names."""

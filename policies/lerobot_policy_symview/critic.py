@@ -33,9 +33,11 @@ class DoubleQ(nn.Module):
         self.group, self.fields = group, fields
         self.from_features = FieldLinear(group, fields, ESTIMATES * fields)
         self.from_action = FieldLinear(group, actions, ESTIMATES * fields)
-        self.weight = nn.Parameter(torch.empty(ESTIMATES, fields))
+        for layer in (self.from_features, self.from_action):  # He et al. (2015), as for one layer of both
+            nn.init.normal_(layer.weight, std=math.sqrt(2 / (group.size * fields + actions.shape[-1])))
+        # Nothing is worth anything at first: the target, which follows slowly, would teach random values for long.
+        self.weight = nn.Parameter(torch.zeros(ESTIMATES, fields))
         self.bias = nn.Parameter(torch.zeros(ESTIMATES))
-        nn.init.normal_(self.weight, std=1 / math.sqrt(fields))
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Map features (B, G, n) and scaled actions (B, A) to values (B, 2)."""

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
@@ -21,21 +19,7 @@ class SymviewBcPolicy(SymviewPolicy):
     name = "symview_bc"
 
     def __init__(self, config: SymviewBcConfig, dataset_stats: dict[str, dict[str, Any]] | None = None, **kwargs: Any):
-        super().__init__(config, dataset_stats)
-        self.config: SymviewBcConfig = config
-        self.network = Network(config, self.inputs, RegressionHead)
-        self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
-
-    def get_optim_params(self) -> Any:
-        """Return every parameter that is trained: one rate for all."""
-        return self.network.parameters()
-
-    def update(self) -> None:
-        """Let the averaged weights follow; LeRobot calls this after every optimiser step."""
-        if self.averaged is not None:
-            with torch.no_grad():
-                for average, current in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
-                    average.lerp_(current, 1 - self.config.weight_averaging)
+        super().__init__(config, RegressionHead, dataset_stats)
 
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
@@ -53,8 +37,7 @@ class SymviewBcPolicy(SymviewPolicy):
             errors = errors + self.config.relaxation_weight * penalty
         return (errors if reduction == "none" else errors.mean()), output
 
-    def best_action(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) for what the network gets."""
-        network = self.network if self.averaged is None else self.averaged
+    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
+        """Return the scaled action (B, A)."""
         actions: Tensor = network(picture, state)
         return actions

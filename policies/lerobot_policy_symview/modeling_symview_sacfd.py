@@ -31,25 +31,22 @@ class SymviewSacfdPolicy(SymviewPolicy):
     def __init__(
         self, config: SymviewSacfdConfig, dataset_stats: dict[str, dict[str, Any]] | None = None, **kwargs: Any
     ):
-        super().__init__(config, dataset_stats)
+        super().__init__(config, partial(GaussianHead, shared=config.actions.shared_scales), dataset_stats)
         self.config: SymviewSacfdConfig = config
-        self.network = Network(config, self.inputs, partial(GaussianHead, shared=config.actions.shared_scales))
-
-    def get_optim_params(self) -> Any:
-        """Return every parameter that is trained: one rate for all."""
-        return self.network.parameters()
 
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, Any]]:
         """Return the squared error of the evaluated action, scaled, mean or (B,), and nothing to log."""
         picture, state, action = self.training_input(batch)
-        errors = functional.mse_loss(self.best_action(picture, state), action, reduction="none").mean(dim=1)
+        errors = functional.mse_loss(self.best_action(self.network, picture, state), action, reduction="none").mean(
+            dim=1
+        )
         return (errors if reduction == "none" else errors.mean()), {}
 
-    def best_action(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) for what the network gets."""
-        mean, _ = self.network(picture, state)
+    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
+        """Return the scaled action (B, A): tanh of the mean."""
+        mean, _ = network(picture, state)
         return torch.tanh(mean)
 
     def draw(self, picture: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,9 @@ from lerobot_symview.calibration import parse_calibration, parse_workspace
 from lerobot_symview.gripper import gripper_image
 from lerobot_symview.views import ReprojectedView
 
+MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
+"""Returns the head of an encoder with so many fields for actions that move by a representation (G, A, A)."""
+
 
 class Network(nn.Module):
     """An encoder and its head.
@@ -35,12 +39,10 @@ class Network(nn.Module):
     Args:
         config: what to build.
         inputs: the numbers beside the picture.
-        make_head: returns the head of an encoder with so many fields for actions that move by (G, A, A).
+        make_head: what makes actions of its fields.
     """
 
-    def __init__(
-        self, config: SymviewConfig, inputs: StateInput, make_head: Callable[[int, NDArray[np.float64]], nn.Module]
-    ):
+    def __init__(self, config: SymviewConfig, inputs: StateInput, make_head: MakeHead):
         super().__init__()
         group = make_group(config.group)
         self.encoder = ENCODERS[config.encoder](config, group, inputs.representation(group))
@@ -61,6 +63,7 @@ class SymviewPolicy(PreTrainedPolicy):
 
     Args:
         config: what to build.
+        make_head: what makes actions of the encoder's fields.
         dataset_stats: ranges of states and actions, which scale them.
     """
 
@@ -71,7 +74,7 @@ class SymviewPolicy(PreTrainedPolicy):
     state_center: Tensor
     state_width: Tensor
 
-    def __init__(self, config: SymviewConfig, dataset_stats: dict[str, dict[str, Any]] | None = None):
+    def __init__(self, config: SymviewConfig, make_head: MakeHead, dataset_stats: dict[str, dict[str, Any]] | None):
         super().__init__(config)
         config.validate_features()
         self.config: SymviewConfig = config
@@ -79,6 +82,8 @@ class SymviewPolicy(PreTrainedPolicy):
         stated = parse_calibration(config.calibration) if config.calibration else None
         self.stated_camera = stated.camera(config.camera) if stated else None
         self.inputs = StateInput(config, self.workspace)
+        self.network = Network(config, self.inputs, make_head)
+        self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
         stats = dataset_stats or {}
         action = _scale(stats.get(keys.ACTION), config.actions)
         state = self.inputs.scale(*_scale(stats.get(keys.STATE), config.states))
@@ -87,8 +92,19 @@ class SymviewPolicy(PreTrainedPolicy):
             self.register_buffer(f"{name}_width", width)
 
     @abstractmethod
-    def best_action(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) for what the network gets."""
+    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
+        """Return the scaled action (B, A) by a network, the trained or the averaged one, for what that gets."""
+
+    def get_optim_params(self) -> Any:
+        """Return every parameter that is trained: one rate for all."""
+        return self.network.parameters()
+
+    def update(self) -> None:
+        """Let the averaged weights follow; LeRobot calls this after every optimiser step."""
+        if self.averaged is not None:
+            with torch.no_grad():
+                for average, current in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
+                    average.lerp_(current, 1 - self.config.weight_averaging)
 
     def reset(self) -> None:
         """Nothing is remembered between steps."""
@@ -102,7 +118,7 @@ class SymviewPolicy(PreTrainedPolicy):
         """Return the action (B, A) for observations (B, ...)."""
         self.eval()
         with self.precision():
-            scaled = self.best_action(*self.network_input(batch))
+            scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
         return self.physical(scaled)
 
     def precision(self) -> AbstractContextManager[Any]:

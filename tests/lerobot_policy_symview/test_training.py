@@ -14,6 +14,7 @@ from symview_sim.env import SymviewEnv
 
 
 def train(monkeypatch, dataset, output, *options):
+    """Run two steps; a later option wins over an earlier one."""
     command = [
         "lerobot-train",
         "--dataset.repo_id=test/recorded",

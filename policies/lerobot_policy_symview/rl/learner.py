@@ -39,7 +39,7 @@ class Learner(nn.Module):
         self.critic = Critic(config, policy.inputs).to(device)
         self.target = deepcopy(self.critic).requires_grad_(False)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature), device=device))
-        trained = {"actor": policy.parameters(), "critic": self.critic.parameters()}
+        trained = {"actor": policy.get_optim_params(), "critic": self.critic.parameters()}
         trained["temperature"] = iter([self.log_temperature])
         self.optimizers = {
             name: torch.optim.Adam(parameters, lr=config.learning_rate) for name, parameters in trained.items()
@@ -83,7 +83,7 @@ class Learner(nn.Module):
         temperature_loss = -self.log_temperature * (log_density.detach().mean() + self.config.entropy)
         if self.config.encoder == "relaxed":
             critic_loss = critic_loss + self.config.relaxation_weight * asymmetry(self.critic)
-            actor_loss = actor_loss + self.config.relaxation_weight * asymmetry(self.policy)
+            actor_loss = actor_loss + self.config.relaxation_weight * asymmetry(self.policy.network)
         # The actor's first: it leaves gradients in the critic's last layers, which the critic's own must not meet.
         for name, loss in (("actor", actor_loss), ("critic", critic_loss), ("temperature", temperature_loss)):
             self.optimizers[name].zero_grad()
@@ -91,6 +91,7 @@ class Learner(nn.Module):
         for optimizer in self.optimizers.values():
             optimizer.step()
         self._follow()
+        self.policy.update()
         measures = (critic_loss, actor_loss, expert_loss, values.mean(), -log_density.mean(), temperature)
         told = {name: value.detach() for name, value in zip(MEASURES, measures, strict=True)}
         return errors.detach().abs().mean(dim=1).cpu().numpy(), told

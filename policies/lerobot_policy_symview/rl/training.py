@@ -56,7 +56,7 @@ class Interval:
         """Add an update's."""
         self.updates += 1
         for name, value in measures.items():
-            self.sums[name] = self.sums.get(name, 0.0) + value.double()
+            self.sums[name] = self.sums.get(name, 0.0) + value
 
     def row(self, names: tuple[str, ...]) -> dict[str, float]:
         """Return means, `nan` where there is nothing to average; reading them waits for a GPU."""
@@ -211,7 +211,11 @@ class Training:
             self._simulators.send(index, Reset(episode.seed, tuple(episode.actions)))
 
     def _receive_episodes(self) -> None:
-        self._batch = self._seen([_acted_upon(self._simulators.receive(index)) for index in range(len(self.episodes))])
+        received = [self._simulators.receive(index) for index in range(len(self.episodes))]
+        for index, outcome in enumerate(received):
+            if outcome.lost:  # begun anew, without the actions
+                self.episodes[index] = Episode(self.episodes[index].seed)
+        self._batch = self._seen([_acted_upon(outcome) for outcome in received])
 
     def _empty_replay(self) -> Replay:
         config = self.config

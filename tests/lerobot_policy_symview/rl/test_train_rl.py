@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.equivariance import assert_equivariant
+from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
 from lerobot_policy_symview.rl.configuration import Demonstrations, TrainRlConfig
@@ -27,6 +28,7 @@ from lerobot_symview import keys
 from lerobot_symview.cli import CommandError
 from lerobot_symview.placement import CameraSpec
 from symview_sim.settings import EnvSettings
+from tests.lerobot_policy_symview.test_training import train
 
 
 def make_config(recorded, folder, **options):
@@ -76,6 +78,25 @@ def test_a_run_leaves_tables_and_a_policy(whole):
     assert all(row["critic_loss"] > 0 for row in training)
     assert (folder / "checkpoints" / "last").resolve() == whole
     assert_equivariant(SymviewSacfdPolicy.from_pretrained(whole / "pretrained_model"))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_acts_and_learns_beside_simulators(method, recorded, tmp_path):
+    env = EnvSettings(max_steps=2, oracle=method == "oracle_equi")
+    config = make_config(recorded, tmp_path, env=env, policy={"method": method}, batch_size=4)
+    with Training(config, open_dataset(config.dataset)) as training:
+        training.begin()
+        for _ in range(3):
+            training.joint_step()
+        assert training.interval.updates == 3
+        assert len(training.interval.success) == 2
+        assert set(training.replay._frames) == set(training.policy.config.network_keys)
+
+
+def test_lerobot_train_fits_the_actor_to_demonstrations(recorded, tmp_path, monkeypatch):
+    options = ("--policy.type=symview_sacfd", "--policy.augmentation=o2")
+    checkpoint = train(monkeypatch, recorded, tmp_path / "fitted", *options)
+    assert SymviewSacfdPolicy.from_pretrained(checkpoint).config.augmentation == "o2"
 
 
 def test_lerobot_eval_finds_what_the_training_found(whole, recorded, monkeypatch, tmp_path):
