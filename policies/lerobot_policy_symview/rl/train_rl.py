@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 EXAMPLES = """\
   symview-train-rl --env.task=block_picking --policy.method=reproj_equi --dataset.root=data/picking
   symview-train-rl --dataset.root=data/picking --policy.method=sideview_nonequi --output_dir=outputs/sideview
-  symview-train-rl --dataset.root=data/picking --policy.width=16 --policy.crop_size=64 --batch_size=32 --steps=2000
+  symview-train-rl --dataset.root=data/picking --policy.width=16 --policy.crop_size=64 --batch_size=32
   symview-train-rl --dataset.root=data/picking --resume=true"""
 
 
