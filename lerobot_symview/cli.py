@@ -96,6 +96,9 @@ def quiet() -> None:
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
+    for other in logging.root.handlers[:]:
+        if type(other) is logging.StreamHandler:  # of LeRobot's import, which logs
+            logging.root.removeHandler(other)
     logging.basicConfig(level=logging.ERROR, handlers=[handler])
     for package in PACKAGES:
         logging.getLogger(package).setLevel(logging.INFO)

@@ -43,7 +43,7 @@ def train_rl(config: TrainRlConfig) -> Path:
             training.begin()
         _tell(training)
         with Records(config, training.step, run_id, description) as records:
-            checkpoint = begun or config.output_dir
+            checkpoint, saved = begun, training.step if begun else None
             while training.step < config.steps and not interruptions:
                 training.joint_step()
                 records.advance()
@@ -54,8 +54,10 @@ def train_rl(config: TrainRlConfig) -> Path:
                 if training.step % config.eval_every == 0 or is_last:
                     found = training.evaluate()
                     records.evaluation(training.step, {"success": found.success_rate, "return": found.mean_return})
-                if training.step % config.save_every == 0 or is_last or interruptions:
-                    checkpoint = save_checkpoint(training, records.run_id)
+                if training.step % config.save_every == 0:
+                    checkpoint, saved = save_checkpoint(training, records.run_id), training.step
+            if checkpoint is None or saved != training.step:
+                checkpoint = save_checkpoint(training, records.run_id)
     if interruptions:
         logger.info("stopped at step %d: the same command with --resume=true goes on from there", training.step)
         raise KeyboardInterrupt
