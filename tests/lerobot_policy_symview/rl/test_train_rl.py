@@ -36,7 +36,7 @@ def make_config(recorded, folder, **options):
     stated = {"steps": 6, "batch_size": 8, "num_simulators": 2, "eval_every": 3, "eval_episodes": 3, "log_every": 2}
     config = TrainRlConfig(
         dataset=Demonstrations("test/recorded", recorded),
-        env=EnvSettings(max_steps=4),
+        env=options.pop("env", EnvSettings(max_steps=4)),
         policy=policy,
         output_dir=folder,
         save_every=100,
