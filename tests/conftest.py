@@ -23,7 +23,8 @@ from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.workspace import Workspace
-from symview_sim.generate import GenerateConfig, RecordedDataset, generate
+from symview_sim.generate import GenerateConfig, generate
+from symview_sim.settings import RecordedDataset
 
 # The same examples every time, so that a failure can be repeated; no time limit, since the first one compiles.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)

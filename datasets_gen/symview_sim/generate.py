@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.camera import project
-from lerobot_symview.cli import DatasetTarget, run_command
+from lerobot_symview.cli import run_command
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, camera_features
 from lerobot_symview.names import lookup
@@ -29,7 +29,7 @@ from symview_sim.recording import (
     recorded_attempts,
     write_shard,
 )
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import EnvSettings, RecordedDataset
 
 logger = logging.getLogger(__name__)
 
@@ -46,14 +46,6 @@ class RecordedEnv(EnvSettings):
 
     oracle: bool = True
     """Also record `top`, which looks straight down and does not see the arm."""
-
-
-@dataclass(frozen=True)
-class RecordedDataset(DatasetTarget):
-    """Where a recording goes."""
-
-    repo_id: str = "symview/demonstrations"
-    """`user/name`, its name on the Hub."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
-"""What an environment is made from, as plain settings that name a task without starting a simulator."""
+"""What an environment is made from, and where its demonstrations are: plain settings that start no simulator."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from lerobot_symview.cli import DatasetTarget
 from lerobot_symview.names import lookup
 from lerobot_symview.placement import CameraSpec
 from symview_sim.robots import ROBOTS
@@ -59,3 +60,11 @@ class EnvSettings:
             start_jitter=self.start_jitter,
             max_steps=self.max_steps,
         )
+
+
+@dataclass(frozen=True)
+class RecordedDataset(DatasetTarget):
+    """Where demonstrations are, or go."""
+
+    repo_id: str = "symview/demonstrations"
+    """`user/name`, its name on the Hub."""

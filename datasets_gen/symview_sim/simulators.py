@@ -11,7 +11,7 @@ import multiprocessing
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -26,6 +26,7 @@ from lerobot_symview.calibration import parse_workspace
 from lerobot_symview.camera import stored_camera
 from lerobot_symview.cli import CommandError
 from lerobot_symview.views import Frame, View, make_view
+from lerobot_symview.workspace import Workspace
 from symview_sim.env import Observation as RawObservation
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
@@ -181,6 +182,11 @@ def _simulate(connection: Connection, observed: Observed) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that trains, which ends this one
     env = observed.env.make()
     views = [make_view(name, **options) for name, options in observed.views.items()]
+    workspace = parse_workspace(observed.workspace)
+
+    def report(raw: RawObservation) -> Observation:
+        return _observation(raw, observed, views, workspace)
+
     while True:
         try:
             command = connection.recv()
@@ -188,27 +194,27 @@ def _simulate(connection: Connection, observed: Observed) -> None:
             env.close()
             return
         start = time.perf_counter()
-        outcome = _carry_out(command, env, observed, views)
+        outcome = _carry_out(command, env, report)
         connection.send(replace(outcome, seconds=time.perf_counter() - start))
 
 
-def _carry_out(command: Reset | Step, env: SymviewEnv, observed: Observed, views: Sequence[View]) -> Outcome:
+def _carry_out(command: Reset | Step, env: SymviewEnv, report: Callable[[RawObservation], Observation]) -> Outcome:
     if isinstance(command, Reset):
         raw, _ = env.reset(seed=command.seed)
         for action in command.actions:
             raw = env.step(action)[0]
-        return Outcome(_observation(raw, observed, views))
+        return Outcome(report(raw))
     raw, reward, terminated, truncated, info = env.step(command.action)
-    observation: Observation | None = _observation(raw, observed, views)
+    observation: Observation | None = report(raw)
     last = None
     if terminated or truncated:
         last, observation = observation, None
         if command.next_seed is not None:
-            observation = _observation(env.reset(seed=command.next_seed)[0], observed, views)
+            observation = report(env.reset(seed=command.next_seed)[0])
     return Outcome(observation, last, reward, terminated, info["is_success"])
 
 
-def _observation(raw: RawObservation, observed: Observed, views: Sequence[View]) -> Observation:
+def _observation(raw: RawObservation, observed: Observed, views: Sequence[View], workspace: Workspace) -> Observation:
     features = named_features(raw)
     camera, depth = observed.camera, keys.depth(observed.camera)
     for view in views:
@@ -217,7 +223,7 @@ def _observation(raw: RawObservation, observed: Observed, views: Sequence[View])
             rgb,
             features[depth][..., 0] if depth in features else None,
             stored_camera(features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], *rgb.shape[:2]),
-            parse_workspace(observed.workspace),
+            workspace,
             features[keys.STATE],
         )
         for output, image in view.render(frame).items():

@@ -20,8 +20,8 @@ from symview_eval.clock import Clock
 from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
 from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
-from symview_sim.settings import EnvSettings
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings, RecordedDataset
 from symview_sim.tasks import TASK_NAMES
 
 REPEATS = 50

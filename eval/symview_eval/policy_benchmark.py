@@ -24,7 +24,8 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.cli import DatasetTarget
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import RecordedDataset
 
 LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
 PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +14,9 @@ import torch
 from tqdm import tqdm
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
-from symview_sim.settings import EnvSettings
+from symview_eval.clock import seconds
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings, RecordedDataset
 from symview_sim.simulators import Reset, Simulators, Step
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
     `simulation_share` the slowest simulator was at work. `sample_ms` is drawing a batch in its stored form,
     `sample_floor_ms` copying as many bytes that lie in a row.
     """
-    from lerobot_policy_symview.rl.configuration import Demonstrations, TrainRlConfig
+    from lerobot_policy_symview.rl.configuration import TrainRlConfig
     from lerobot_policy_symview.rl.demonstrations import open_dataset
     from lerobot_policy_symview.rl.training import Training
 
@@ -68,7 +68,7 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
         target = RecordedDataset("benchmark/recorded", Path(folder) / "recorded")
         generate(GenerateConfig(target, env=RecordedEnv(**vars(config.env)), num_episodes=DEMONSTRATIONS))
         training_config = TrainRlConfig(
-            dataset=Demonstrations(target.repo_id, target.root),
+            dataset=target,
             env=config.env,
             policy=config.policy,
             output_dir=Path(folder),
@@ -80,13 +80,13 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
             Simulators(training.observed, config.num_simulators) as alone,
         ):
             training.begin()
-            seconds = _joint_steps(config, training, alone)
+            costs = _joint_steps(config, training, alone)
             samples = _samples(config, training.replay)
             total = training.seconds["total"]
             shares = {f"{name}_share": training.seconds[name] / total for name in ("network", "waiting", "simulation")}
             return {
-                "joint_step_ratio": seconds["joint_step_s"] / max(seconds["network_s"], seconds["simulation_s"]),
-                **seconds,
+                "joint_step_ratio": costs["joint_step_s"] / max(costs["network_s"], costs["simulation_s"]),
+                **costs,
                 **shares,
                 **samples,
                 "bytes_per_transition": training.replay.bytes_per_transition,
@@ -119,7 +119,7 @@ def _joint_steps(config: RlBenchmark, training: Training, alone: Simulators) -> 
     training.seconds = dict.fromkeys(training.seconds, 0.0)
     for _ in tqdm(range(config.rounds), desc="joint steps", unit="round"):
         for name, part in parts.items():
-            times[name].append(_seconds(part))
+            times[name].append(seconds(part))
     return {name: statistics.median(values) for name, values in times.items()}
 
 
@@ -133,14 +133,6 @@ def _samples(config: RlBenchmark, replay: Replay) -> dict[str, float]:
         for source, target in zip(sources, targets, strict=True):
             target.copy_(source)
 
-    times = [(_seconds(lambda: replay.sample(config.batch_size, BETA, rng)), _seconds(copy)) for _ in range(SAMPLES)]
+    times = [(seconds(lambda: replay.sample(config.batch_size, BETA, rng)), seconds(copy)) for _ in range(SAMPLES)]
     drawn, copied = (1000 * statistics.median(column) for column in zip(*times, strict=True))
     return {"sample_ms": drawn, "sample_floor_ms": copied}
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    call()
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter() - start

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import statistics
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,9 +24,9 @@ from lerobot_symview.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.perspective import image_from_topdown
 from lerobot_symview.source_dataset import SourceDataset
 from lerobot_symview.views import Frame, make_view
-from symview_eval.clock import Clock
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
-from symview_sim.settings import EnvSettings
+from symview_eval.clock import Clock, seconds
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings, RecordedDataset
 
 BATCH = 64  # frames on a GPU
 NOISE = 2.0  # levels of 255, standard deviation: a webcam indoors
@@ -111,12 +110,13 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
     moved = torch.empty(BATCH * _moved_bytes(frame), dtype=torch.uint8, device=device)
     target = torch.empty_like(moved)
 
-    def seconds(call: Callable[[], object]) -> float:
+    def finished(call: Callable[[], object]) -> float:
+        def whole() -> None:
+            call()
+            synchronize()
+
         synchronize()
-        start = time.perf_counter()
-        call()
-        synchronize()
-        return time.perf_counter() - start
+        return seconds(whole)
 
     results = {}
     for name in ("reproject_nearest", "reproject_none", "perspective"):
@@ -124,7 +124,7 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
         view = make_view(view_name, **options)
         render = partial(render_batch, view, batch)
         render()
-        times = [(seconds(render), seconds(lambda: target.copy_(moved))) for _ in range(repeats)]
+        times = [(finished(render), finished(lambda: target.copy_(moved))) for _ in range(repeats)]
         results[f"batched_{name}_us"] = 1e6 * statistics.median(one for one, _ in times) / BATCH
         results[f"batched_{name}_copy_ratio"] = statistics.median(one / copy for one, copy in times)
     return results
@@ -167,10 +167,11 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
         warp()
         ratios = []
         for _ in range(repeats):
-            seconds, reference = _seconds(candidate), _seconds(warp)
+            reference = seconds(warp)
             warps.append(reference)
-            ratios.append(seconds / reference)
-        low, median, high = statistics.quantiles(ratios, n=4) if repeats > 1 else ratios * 3
+            ratios.append(seconds(candidate) / reference)
+        # inclusive: no quartile lies outside of what was measured
+        low, median, high = statistics.quantiles(ratios, n=4, method="inclusive") if repeats > 1 else ratios * 3
         results |= {f"{name}_ratio": median, f"{name}_ratio_low": low, f"{name}_ratio_high": high}
     return {"warp_us": 1e6 * statistics.median(warps)} | results
 
@@ -187,7 +188,7 @@ def _offline(frames: int) -> dict[str, float]:
                 views=["reproj", "persp"],
                 num_workers=num_workers,
             )
-            return _seconds(lambda: add_views(config))
+            return seconds(lambda: add_views(config))
 
         add(recorded, "first")  # imports and compiled kernels are loaded before the clocks start
         with _codec_clocks() as clocks:
@@ -243,9 +244,3 @@ def _codec_clocks() -> Iterator[list[Clock]]:
     finally:
         for clock in clocks:
             clock.remove()
-
-
-def _seconds(call: Callable[[], Any]) -> float:
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start

@@ -39,9 +39,8 @@ class SymviewSacfdPolicy(SymviewPolicy):
     ) -> tuple[Tensor, dict[str, Any]]:
         """Return the squared error of the evaluated action, scaled, mean or (B,), and nothing to log."""
         picture, state, action = self.training_input(batch)
-        errors = functional.mse_loss(self.best_action(self.network, picture, state), action, reduction="none").mean(
-            dim=1
-        )
+        best = self.best_action(self.network, picture, state)
+        errors = functional.mse_loss(best, action, reduction="none").mean(dim=1)
         return (errors if reduction == "none" else errors.mean()), {}
 
     def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:

@@ -17,7 +17,8 @@ from lerobot_symview.placement import CameraSpec, CameraSpread
 from lerobot_symview.source_dataset import vectors
 from lerobot_symview.views import VIEWS, Frame, make_view
 from lerobot_symview.workspace import Workspace
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import RecordedDataset
 from tests.conftest import VIEW_SIZE
 from tests.lerobot_symview.derived import contents, views_config
 from tests.lerobot_symview.test_upsampling import plane_depth

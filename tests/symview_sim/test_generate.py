@@ -19,7 +19,8 @@ from lerobot_symview.placement import CameraSpec, CameraSpread
 from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
-from symview_sim.generate import GenerateConfig, RecordedDataset, RecordedEnv, generate
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import RecordedDataset
 from tests.conftest import EPISODES, largest_file
 
 SMALL = RecordedEnv(camera=CameraSpec(height=32, width=32), oracle=False)

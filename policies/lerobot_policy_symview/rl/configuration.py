@@ -9,23 +9,14 @@ from lerobot.configs.default import WandBConfig
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.rl.replay import ReplayConfig
-from lerobot_symview.cli import DatasetTarget
-from symview_sim.settings import EnvSettings
-
-
-@dataclass(frozen=True)
-class Demonstrations(DatasetTarget):
-    """Where the demonstrations are."""
-
-    repo_id: str = "symview/demonstrations"
-    """`user/name`, its name on the Hub."""
+from symview_sim.settings import EnvSettings, RecordedDataset
 
 
 @dataclass(frozen=True)
 class TrainRlConfig:
     """Train a policy by soft actor-critic from demonstrations, in simulators that run beside the updates."""
 
-    dataset: Demonstrations = field(default_factory=Demonstrations)
+    dataset: RecordedDataset = field(default_factory=RecordedDataset)
     """Demonstrations of the task, by the same cameras."""
     env: EnvSettings = field(default_factory=EnvSettings)
     """What is simulated."""

@@ -5,10 +5,11 @@ import statistics
 import pytest
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.rl.configuration import Demonstrations, TrainRlConfig
+from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.train_rl import train_rl
-from symview_sim.generate import GenerateConfig, RecordedDataset, generate
+from symview_sim.generate import GenerateConfig, generate
+from symview_sim.settings import RecordedDataset
 
 
 def learning_curve(data, folder, method):
@@ -17,7 +18,7 @@ def learning_curve(data, folder, method):
         device="cpu", method=method, width=16, crop_size=64, expert_weight=10, weight_averaging=0.99
     )
     config = TrainRlConfig(
-        dataset=Demonstrations("test/picking", data),
+        dataset=RecordedDataset("test/picking", data),
         policy=policy,
         output_dir=folder,
         steps=1000,

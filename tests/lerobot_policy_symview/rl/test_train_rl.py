@@ -17,7 +17,7 @@ from lerobot_policy_symview.equivariance import assert_equivariant
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
-from lerobot_policy_symview.rl.configuration import Demonstrations, TrainRlConfig
+from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.demonstrations import open_dataset, outcomes
 from lerobot_policy_symview.rl.learner import WEIGHTS
 from lerobot_policy_symview.rl.records import read_table
@@ -27,7 +27,7 @@ from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError
 from lerobot_symview.placement import CameraSpec
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.lerobot_policy_symview.test_training import train
 
 
@@ -35,7 +35,7 @@ def make_config(recorded, folder, **options):
     policy = SymviewSacfdConfig(device="cpu", width=16, crop_size=64, **options.pop("policy", {}))
     stated = {"steps": 6, "batch_size": 8, "num_simulators": 2, "eval_every": 3, "eval_episodes": 3, "log_every": 2}
     config = TrainRlConfig(
-        dataset=Demonstrations("test/recorded", recorded),
+        dataset=RecordedDataset("test/recorded", recorded),
         env=options.pop("env", EnvSettings(max_steps=4)),
         policy=policy,
         output_dir=folder,
