@@ -10,10 +10,13 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partialmethod
 from importlib import import_module
 from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Any, Protocol, Self
+
+from tqdm import tqdm
 
 from lerobot_symview.cli import CommandError, quiet
 
@@ -77,7 +80,10 @@ class ProcessExecutor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is KeyboardInterrupt:  # who wants to stop does not want to wait for what is under way
+            for process in multiprocessing.active_children():
+                process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -136,14 +142,16 @@ def _worker_deaths() -> Iterator[None]:
         yield
     except BrokenProcessPool:
         raise CommandError(
-            "a worker process died, perhaps for lack of memory: repeat the command with --resume=true "
-            "and a smaller --num_workers"
+            "a worker process died, perhaps for lack of memory: repeat the command with a smaller --num_workers, "
+            "and with --resume=true if it has that flag"
         ) from None
 
 
 def _start_worker() -> None:
     """Leave Ctrl-C to the parent, and end when it does: a worker whose parent is killed would wait for ever."""
     quiet()
+    # Bars of several processes would overwrite each other.
+    tqdm.__init__ = partialmethod(tqdm.__init__, disable=True)  # type: ignore[method-assign, assignment]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

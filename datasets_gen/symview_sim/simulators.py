@@ -19,6 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
@@ -115,6 +116,11 @@ class Simulators:
     def process_ids(self) -> list[int]:
         """The processes that simulate."""
         return [process.pid or 0 for process, _ in self._workers]
+
+    def cpu_seconds(self) -> float:
+        """Return the processor time that all of them have taken."""
+        used = [psutil.Process(process_id).cpu_times() for process_id in self.process_ids]
+        return float(sum(times.user + times.system for times in used))
 
     def is_alive(self, index: int) -> bool:
         """Whether a simulator's process runs."""

@@ -1,4 +1,4 @@
-"""`symview-benchmark`: what experts achieve, what a simulated step, a view and an update cost, as tables or JSON."""
+"""`symview-benchmark`: what experts achieve, what a step, a view, an update and a run cost, as tables or JSON."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from tqdm import tqdm
 from lerobot_symview.cli import USAGE, run_command
 from lerobot_symview.names import lookup
 from symview_eval.clock import Clock
+from symview_eval.experiment_benchmark import ExperimentBenchmark, benchmark_experiment
 from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
 from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
@@ -36,7 +37,8 @@ EXAMPLES = """\
   symview-benchmark env --json=true
   symview-benchmark views
   symview-benchmark policy --batch_size=32
-  symview-benchmark rl --policy.width=16 --policy.crop_size=64 --batch_size=32"""
+  symview-benchmark rl --policy.width=16 --policy.crop_size=64 --batch_size=32
+  symview-benchmark experiment --scale=laptop"""
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,7 @@ SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
     "views": (ViewsBenchmark, benchmark_views),
     "policy": (PolicyBenchmark, benchmark_policy),
     "rl": (RlBenchmark, benchmark_rl),
+    "experiment": (ExperimentBenchmark, benchmark_experiment),
 }
 
 

@@ -60,8 +60,8 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
     `simulation_share` the slowest simulator was at work. `sample_ms` is drawing a batch in its stored form,
     `sample_floor_ms` copying as many bytes that lie in a row.
     """
+    from lerobot_policy_symview.demonstrations import open_dataset
     from lerobot_policy_symview.rl.configuration import TrainRlConfig
-    from lerobot_policy_symview.rl.demonstrations import open_dataset
     from lerobot_policy_symview.rl.training import Training
 
     with tempfile.TemporaryDirectory() as folder:

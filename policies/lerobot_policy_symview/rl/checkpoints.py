@@ -34,7 +34,7 @@ def save_checkpoint(training: Training, run_id: str | None) -> Path:
     part = part_of(folder)
     model, state = part / PRETRAINED_MODEL_DIR, part / TRAINING_STATE_DIR
     state.mkdir(parents=True)
-    for one in (training.policy, *training.processors):
+    for one in (training.policy, training.actor.preprocessor, training.actor.postprocessor):
         one.save_pretrained(model)
     (model / CONFIGURATION).write_text(json.dumps(describe(training.config), indent=4))
     training.learner.save(state)

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Frame = dict[str, NDArray[Any]]
+from lerobot_policy_symview.frames import Frame
 
 
 @dataclass(frozen=True)

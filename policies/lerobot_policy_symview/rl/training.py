@@ -20,17 +20,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_policy_symview.demonstrations import check_scene, observations, outcomes, ranges
+from lerobot_policy_symview.frames import Frame
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
-from lerobot_policy_symview.processors import make_processors
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
-from lerobot_policy_symview.rl.demonstrations import check_scene, observations, outcomes, ranges
-from lerobot_policy_symview.rl.evaluation import Evaluation, evaluate
 from lerobot_policy_symview.rl.learner import Learner
-from lerobot_policy_symview.rl.replay import Frame, Replay
-from symview_sim.simulators import Observation, Observed, Outcome, Reset, Simulators, Step
+from lerobot_policy_symview.rl.replay import Replay
+from lerobot_policy_symview.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from symview_sim.simulators import Observation, Outcome, Reset, Simulators, Step
 
 EXPERT = 0  # the stream of the demonstrations; simulator i has the stream i + 1
-EVALUATION_SEED = 1000  # lerobot-eval's first, so that both see the same scenes
 
 
 @dataclass
@@ -93,15 +92,9 @@ class Training:
             policy.view_options.setdefault("size", policy.image_size)
         self.policy = SymviewSacfdPolicy(policy, ranges(dataset, (space.low, space.high)))
         self.policy.to(policy.device)
-        self.processors = make_processors(policy)
+        self.actor = Actor(self.policy)
         self.learner = Learner(self.policy)
-        self.observed = Observed(
-            env=config.env,
-            names=tuple(policy.network_keys),
-            views=policy.computed_views,
-            camera=policy.camera,
-            workspace=policy.workspace,
-        )
+        self.observed = observed(policy, config.env)
         self.replay = self._empty_replay()
         self._simulators = Simulators(self.observed, config.num_simulators)
         self._evaluators: Simulators | None = None
@@ -176,16 +169,12 @@ class Training:
         """Run the policy, without chance, on scenes that training does not see."""
         if self._evaluators is None:
             self._evaluators = Simulators(self.observed, self.config.num_simulators)
-
-        def act(seen: list[Observation]) -> NDArray[np.float32]:
-            return self.processors[1](self.policy.select_action(self._seen(seen))).numpy()
-
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.config.eval_episodes)
-        return evaluate(act, self._evaluators, seeds, self.config.policy.discount)
+        return evaluate(self.actor, self._evaluators, seeds, self.config.policy.discount)
 
     def _take_in(self, scaled: NDArray, actions: NDArray[np.float32], received: list[Outcome]) -> None:
         """Remember what came of the actions."""
-        self._batch = self._seen([_acted_upon(outcome) for outcome in received])
+        self._batch = self.actor.seen([_acted_upon(outcome) for outcome in received])
         frames = self.learner.codec.pack(self._batch)
         for index, (outcome, frame) in enumerate(zip(received, frames, strict=True)):
             stream, episode = index + 1, self.episodes[index]
@@ -215,7 +204,7 @@ class Training:
         for index, outcome in enumerate(received):
             if outcome.lost:  # begun anew, without the actions
                 self.episodes[index] = Episode(self.episodes[index].seed)
-        self._batch = self._seen([_acted_upon(outcome) for outcome in received])
+        self._batch = self.actor.seen([_acted_upon(outcome) for outcome in received])
 
     def _empty_replay(self) -> Replay:
         config = self.config
@@ -223,7 +212,7 @@ class Training:
         share = math.ceil(min(config.replay.capacity / config.num_simulators, config.steps))
         length = share + share // config.env.max_steps + 2
         observation, action = next(observations(self._dataset))
-        example = self.learner.codec.pack(self.processors[0](observation))[0]
+        example = self.learner.codec.pack(self.actor.preprocessor(observation))[0]
         lengths = [len(self._dataset), *[length] * config.num_simulators]
         return Replay(config.replay, example, action.shape[1], lengths, config.output_dir / "replay")
 
@@ -233,7 +222,7 @@ class Training:
         frames: list[Frame] = []
         actions = []
         for observation, action in tqdm(observations(self._dataset), desc="demonstrations", unit="batch", leave=False):
-            frames += self.learner.codec.pack(self.processors[0](observation))
+            frames += self.learner.codec.pack(self.actor.preprocessor(observation))
             actions.append(self.policy.scaled(action.to(self.policy.action_center.device)).clamp(-1, 1).cpu().numpy())
         scaled = np.concatenate(actions)
         begins = np.append(True, ends[:-1])
@@ -243,18 +232,12 @@ class Training:
             if not ends[i] or succeeds[i]:  # what followed the last frame of a failure is not known
                 self.replay.add(EXPERT, scaled[i], reward[i], bool(succeeds[i]), None if ends[i] else frames[i + 1])
 
-    def _seen(self, seen: list[Observation]) -> dict[str, Tensor]:
-        """Return B observations as the policy's preprocessor leaves them."""
-        stacked = {name: torch.from_numpy(np.stack([one[name] for one in seen])) for name in seen[0]}
-        batch: dict[str, Tensor] = self.processors[0]({name: _as_delivered(values) for name, values in stacked.items()})
-        return batch
-
     def _pack(self, seen: Observation | None) -> Frame:
         assert seen is not None
-        return self.learner.codec.pack(self._seen([seen]))[0]
+        return self.learner.codec.pack(self.actor.seen([seen]))[0]
 
     def _physical(self, scaled: Tensor) -> NDArray[np.float32]:
-        actions: Tensor = self.processors[1](self.policy.physical(scaled))
+        actions: Tensor = self.actor.postprocessor(self.policy.physical(scaled))
         return actions.numpy()
 
     def _seed(self, simulator: int, episode: int) -> int:
@@ -265,11 +248,3 @@ class Training:
 def _acted_upon(outcome: Outcome) -> Observation:
     assert outcome.observation is not None
     return outcome.observation
-
-
-def _as_delivered(values: Tensor) -> Tensor:
-    """Return images (B, H, W, C) as LeRobot delivers an environment's: (B, C, H, W), colour in [0, 1]."""
-    if values.ndim != 4:
-        return values
-    values = values.permute(0, 3, 1, 2)
-    return values.float() / 255 if values.dtype == torch.uint8 else values

@@ -13,12 +13,12 @@ from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from lerobot_policy_symview.demonstrations import open_dataset, outcomes
 from lerobot_policy_symview.equivariance import assert_equivariant
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
-from lerobot_policy_symview.rl.demonstrations import open_dataset, outcomes
 from lerobot_policy_symview.rl.learner import WEIGHTS
 from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.replay import ReplayConfig

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_policy_symview.augmentation import scale_down
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
 from lerobot_policy_symview.processor_views import metres
-from lerobot_policy_symview.rl.replay import Frame
+
+Frame = dict[str, NDArray[Any]]
+"""What a network needs of one observation, packed."""
 
 
 class FrameCodec:

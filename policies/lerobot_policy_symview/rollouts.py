@@ -1,4 +1,4 @@
-"""How well a policy does, in several simulators at once."""
+"""Policies in simulators: what they see there, and how well they do in several at once."""
 
 from __future__ import annotations
 
@@ -8,13 +8,65 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
-from symview_sim.simulators import Observation, Reset, Simulators, Step
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.policy import SymviewPolicy
+from lerobot_policy_symview.processors import make_processors
+from symview_sim.settings import EnvSettings
+from symview_sim.simulators import Observation, Observed, Reset, Simulators, Step
+
+EVALUATION_SEED = 1000  # lerobot-eval's first, so that both see the same scenes
 
 Act = Callable[[list[Observation]], NDArray[np.float32]]
 """Maps B observations to B actions in metres and radians, (B, A)."""
+
+
+class Actor:
+    """A policy with its processors, acting on what simulators report.
+
+    Args:
+        policy: the policy.
+    """
+
+    def __init__(self, policy: SymviewPolicy):
+        self.policy = policy
+        self.preprocessor, self.postprocessor = make_processors(policy.config)
+
+    def seen(self, observations: list[Observation]) -> dict[str, Tensor]:
+        """Return B observations as the preprocessor leaves them."""
+        names = observations[0]
+        stacked = {name: torch.from_numpy(np.stack([one[name] for one in observations])) for name in names}
+        delivered = {name: _as_delivered(values) for name, values in stacked.items()}
+        batch: dict[str, Tensor] = self.preprocessor(delivered)
+        return batch
+
+    def __call__(self, observations: list[Observation]) -> NDArray[np.float32]:
+        """Return the actions (B, A), in metres and radians."""
+        actions: Tensor = self.postprocessor(self.policy.select_action(self.seen(observations)))
+        return actions.numpy()
+
+
+def _as_delivered(values: Tensor) -> Tensor:
+    """Return images (B, H, W, C) as LeRobot delivers an environment's: (B, C, H, W), colour in [0, 1]."""
+    if values.ndim != 4:
+        return values
+    values = values.permute(0, 3, 1, 2)
+    return values.float() / 255 if values.dtype == torch.uint8 else values
+
+
+def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
+    """Return what simulators of `env` must report for a policy to act."""
+    return Observed(
+        env=env,
+        names=tuple(config.network_keys),
+        views=config.computed_views,
+        camera=config.camera,
+        workspace=config.workspace,
+    )
 
 
 @dataclass(frozen=True)

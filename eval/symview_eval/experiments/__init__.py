@@ -1,0 +1,1 @@
+"""The paper's tables and figures, rerun at a stated scale."""

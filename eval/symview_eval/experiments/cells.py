@@ -1,0 +1,169 @@
+"""A cell of an experiment, from its demonstrations to its results; what worker processes run."""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import time
+import traceback
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from lerobot_policy_symview.demonstrations import open_dataset
+from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.train_rl import train_rl
+from lerobot_symview.placement import CameraSpec
+from symview_eval.experiments.cloning import clone
+from symview_eval.experiments.grid import Cell
+from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings, RecordedDataset
+
+logger = logging.getLogger(__name__)
+
+DISCOUNT = 0.99  # paper A.3
+RL_SIMULATORS = 5
+
+
+@dataclass(frozen=True)
+class Job:
+    """A cell and where it is done."""
+
+    cell: Cell
+    results: Path
+    """Folder of all results."""
+    folder: Path
+    """Folder of recordings and policies."""
+    device: str
+    """Of the networks."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What became of a job."""
+
+    cell: Cell
+    seconds: float
+    failure: str = ""
+    """Why there is no result; empty if there is one."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Demonstrations to make."""
+
+    folder: Path
+    """Where all of them are."""
+    name: str
+    task: str
+    elevation_deg: float
+    episodes: int
+    seed: int
+
+
+def recording(cell: Cell, folder: Path) -> Recording:
+    """Return the demonstrations that a cell learns from."""
+    return Recording(
+        _recordings(folder), cell.recording, cell.task, cell.row.elevation_deg, cell.demonstrations, cell.seed
+    )
+
+
+def record(wanted: Recording) -> str:
+    """Make demonstrations, unless they are there already, and return their name."""
+    env = RecordedEnv(task=wanted.task, camera=CameraSpec(elevation_deg=wanted.elevation_deg))
+    target = _dataset(wanted.folder, wanted.name)
+    generate(GenerateConfig(target, env=env, num_episodes=wanted.episodes, seed=wanted.seed, resume=True))
+    return wanted.name
+
+
+def run_cell(job: Job) -> Done:
+    """Train and evaluate a cell's policy; write its results and keep the policy.
+
+    A failure ends this cell only.
+    """
+    start = time.perf_counter()
+    torch.set_num_threads(1)  # sums of more would differ in their last bits, and with them what is learned
+    try:
+        _run(job, start)
+    except Exception as error:  # whatever it is, the other cells go on and the user is told
+        logger.debug("%s", traceback.format_exc())
+        return Done(job.cell, time.perf_counter() - start, f"{type(error).__name__}: {error}")
+    return Done(job.cell, time.perf_counter() - start)
+
+
+def _run(job: Job, start: float) -> None:
+    cell = job.cell
+    env = EnvSettings(
+        task=cell.task,
+        camera=CameraSpec(elevation_deg=cell.row.elevation_deg),
+        oracle=cell.row.policy["method"].startswith("oracle"),
+        max_steps=cell.scale.max_steps,
+    )
+    target = _dataset(_recordings(job.folder), cell.recording)
+    kept = job.folder / "policies" / cell.path.with_suffix("")
+    times = Times()
+    if cell.algorithm == "sacfd":
+        checkpoints = _reinforce(cell, target, env, kept, job.device)
+    else:
+        cloned = clone(cell, open_dataset(target), env, job.device, DISCOUNT)
+        checkpoints, actor, times = cloned.checkpoints, cloned.actor, cloned.times
+        for part in (actor.policy, actor.preprocessor, actor.postprocessor):
+            part.save_pretrained(kept / "pretrained_model")
+    origin = Origin(
+        configuration=cell.configuration_hash,
+        version=version("lerobot_policy_symview"),
+        machine=_machine(job.device),
+        seconds=time.perf_counter() - start,
+        device=job.device,
+    )
+    write_result(job.results / cell.path, Result(origin, times, checkpoints))
+
+
+def _reinforce(cell: Cell, target: RecordedDataset, env: EnvSettings, output: Path, device: str) -> list[Checkpoint]:
+    """Run `symview-train-rl`, or go on with it, and return its evaluations, steps being the environments'."""
+    scale = cell.scale
+    config = TrainRlConfig(
+        dataset=target,
+        env=env,
+        policy=SymviewSacfdConfig(
+            device=device, push_to_hub=False, discount=DISCOUNT, **scale.policy, **cell.row.policy
+        ),
+        output_dir=output,
+        steps=cell.steps,
+        batch_size=scale.batch_size,
+        num_simulators=RL_SIMULATORS,
+        seed=cell.seed,
+        eval_every=scale.rl_eval_every,
+        eval_episodes=scale.eval_episodes,
+        resume=(output / "checkpoints" / "last").exists(),
+    )
+    train_rl(config)
+    return [
+        Checkpoint(
+            step=RL_SIMULATORS * int(row["step"]),
+            successes=round(row["success"] * scale.eval_episodes),
+            episodes=scale.eval_episodes,
+            mean_return=row["return"],
+            loss=float("nan"),
+        )
+        for row in read_table(output / "evaluation.csv")
+    ]
+
+
+def _recordings(folder: Path) -> Path:
+    return folder / "recordings"
+
+
+def _dataset(recordings: Path, name: str) -> RecordedDataset:
+    return RecordedDataset(f"symview/{name}", recordings / name)
+
+
+def _machine(device: str) -> str:
+    gpu = f", {torch.cuda.get_device_name()}" if device.startswith("cuda") else ""
+    return f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores{gpu}"

@@ -1,0 +1,171 @@
+"""Behaviour cloning with its demonstrations in memory, evaluated in simulators while it goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from lerobot.policies import make_policy
+from lerobot.scripts.lerobot_train import update_policy
+from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
+from lerobot.utils.random_utils import set_seed
+from torch import Tensor
+
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.demonstrations import observations
+from lerobot_policy_symview.frames import FrameCodec
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_symview import keys
+from symview_eval.experiments.grid import Cell
+from symview_eval.experiments.results import Checkpoint, Times
+from symview_sim.settings import EnvSettings
+from symview_sim.simulators import Simulators
+
+GRADIENT_NORM = 10.0  # lerobot-train cuts gradients there
+
+
+@dataclass(frozen=True)
+class Cloned:
+    """What came of a training."""
+
+    checkpoints: list[Checkpoint]
+    actor: Actor
+    times: Times
+
+
+class Demonstrations:
+    """Frames that a policy's network needs, and the actions, on its device.
+
+    Args:
+        dataset: a `LeRobotDataset` with what the camera saw.
+        actor: the policy, whose view is made once here.
+    """
+
+    def __init__(self, dataset: Any, actor: Actor):
+        self._device = torch.device(actor.policy.config.device)
+        self._codec = FrameCodec(actor.policy.config)
+        frames, actions = [], []
+        for observation, action in observations(dataset):
+            frames += self._codec.pack(actor.preprocessor(observation))
+            actions.append(action)
+        self._frames = {
+            name: torch.stack([torch.from_numpy(frame[name]) for frame in frames]).to(self._device)
+            for name in frames[0]
+        }
+        self._actions = torch.cat(actions).to(self._device)
+
+    def batches(self, size: int, seed: int) -> Iterator[dict[str, Tensor]]:
+        """Yield batches without end: every frame once, in random order, before any comes again."""
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.empty(0, dtype=torch.long)
+        while True:
+            while len(order) < size:
+                order = torch.cat([order, torch.randperm(len(self._actions), generator=generator)])
+            chosen, order = order[:size].to(self._device), order[size:]
+            batch = self._codec.unpack({name: values[chosen] for name, values in self._frames.items()}, self._device)
+            yield batch | {keys.ACTION: self._actions[chosen]}
+
+
+class Evaluator:
+    """Evaluates policies as they are now, one after the other, while their training goes on.
+
+    Args:
+        simulators: where.
+        episodes: of each evaluation.
+        first_seed: of their scenes, which are others in every evaluation.
+        discount: of returns.
+    """
+
+    def __init__(self, simulators: Simulators, episodes: int, first_seed: int, discount: float):
+        self._simulators, self._episodes, self._next_seed, self._discount = simulators, episodes, first_seed, discount
+        threads = torch.get_num_threads()
+        self._thread = ThreadPoolExecutor(1, "evaluation", initializer=torch.set_num_threads, initargs=(threads,))
+        self.seconds = 0.0
+
+    def __enter__(self) -> Evaluator:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+
+    def submit(self, policy: SymviewBcPolicy) -> Future[Evaluation]:
+        """Have a copy of a policy evaluated."""
+        seeds = range(self._next_seed, self._next_seed + self._episodes)
+        self._next_seed += self._episodes
+        return self._thread.submit(self._evaluate, Actor(deepcopy(policy)), seeds)
+
+    def _evaluate(self, actor: Actor, seeds: Sequence[int]) -> Evaluation:
+        start = time.perf_counter()
+        found = evaluate(actor, self._simulators, seeds, self._discount)
+        self.seconds += time.perf_counter() - start
+        return found
+
+
+def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
+    """Return the policy of a cell."""
+    config = SymviewBcConfig(
+        device=device,
+        push_to_hub=False,
+        learning_rate_decay=cell.scale.learning_rate_decay,
+        **cell.scale.policy,
+        **cell.row.policy,
+    )
+    if config.is_computed:
+        config.view_options = {"size": config.image_size, **config.view_options}
+    return config
+
+
+def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str, discount: float) -> Cloned:
+    """Train and evaluate a cell's policy, with LeRobot's own update."""
+    scale = cell.scale
+    begin, begin_cpu = time.perf_counter(), time.process_time()
+    set_seed(cell.seed)
+    config = policy_config(cell, device)
+    policy: Any = make_policy(config, ds_meta=dataset.meta)
+    actor = Actor(policy)
+    batches = Demonstrations(dataset, actor).batches(scale.batch_size, cell.seed)
+    optimizer: Any = config.get_optimizer_preset().build(policy.get_optim_params())
+    schedule = config.get_scheduler_preset()
+    scheduler = schedule.build(optimizer, scale.steps) if schedule is not None else None
+    accelerator = Accelerator(cpu=device == "cpu")
+    evaluations = scale.steps // scale.eval_every
+    first_seed = EVALUATION_SEED + cell.seed * evaluations * scale.eval_episodes
+    pending: list[tuple[int, float, Future[Evaluation]]] = []
+    with (
+        Simulators(observed(config, env), scale.simulators) as simulators,
+        Evaluator(simulators, scale.eval_episodes, first_seed, discount) as evaluator,
+    ):
+        metrics = _metrics(scale.batch_size)
+        ready = time.perf_counter()
+        for step in range(1, scale.steps + 1):
+            update_policy(metrics, policy, next(batches), optimizer, GRADIENT_NORM, accelerator, scheduler)
+            if step % scale.eval_every == 0:
+                pending.append((step, metrics.loss.avg, evaluator.submit(policy)))
+                metrics.reset_averages()
+        trained = time.perf_counter()
+        checkpoints = [_checkpoint(step, loss, evaluation.result()) for step, loss, evaluation in pending]
+        times = Times(
+            preparation_s=ready - begin,
+            training_s=trained - ready,
+            waiting_s=time.perf_counter() - trained,
+            evaluation_s=evaluator.seconds,
+            cpu_s=time.process_time() - begin_cpu + simulators.cpu_seconds(),
+        )
+        return Cloned(checkpoints, actor, times)
+
+
+def _checkpoint(step: int, loss: float, found: Evaluation) -> Checkpoint:
+    return Checkpoint(step, sum(found.success), len(found.success), found.mean_return, loss)
+
+
+def _metrics(batch_size: int) -> Any:
+    """Return what LeRobot's update writes its measures into."""
+    meters = {name: AverageMeter(name, ":.3f") for name in ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")}
+    return MetricsTracker(batch_size, 1, 1, meters)

@@ -1,0 +1,119 @@
+"""Pictures of results."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from symview_eval.experiments.grid import Experiment
+from symview_eval.experiments.results import Result
+from symview_eval.experiments.summary import Entry
+
+OURS, THEIRS = "#1f5fa8", "#c2571a"
+
+
+def plot(experiment: Experiment, found: Sequence[Entry]) -> Figure:
+    """Return the picture that suits an experiment: learning curves, success by angle, or success by row."""
+    if experiment.algorithm == "sacfd":
+        return _curves(found)
+    if experiment.name == "figure7":
+        return _angles(found)
+    return _rows(found)
+
+
+def _panels(found: Sequence[Entry], height: float) -> tuple[Figure, dict[tuple[str, int], Any]]:
+    """Return a panel for every task and number of demonstrations."""
+    names = list(dict.fromkeys((entry.task, entry.demonstrations) for entry in found))
+    columns = min(3, len(names))
+    rows = math.ceil(len(names) / columns)
+    figure = Figure(figsize=(4.6 * columns, height * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flatten()
+    for unused in axes[len(names) :]:
+        unused.set_axis_off()
+    for (task, demonstrations), axis in zip(names, axes, strict=False):
+        axis.set_title(f"{task.replace('_', ' ')}, {demonstrations} demonstrations", fontsize=10)
+        axis.grid(alpha=0.3)
+    return figure, dict(zip(names, axes, strict=False))
+
+
+def _rows(found: Sequence[Entry]) -> Figure:
+    figure, panels = _panels(found, 2.6)
+    for place, axis in panels.items():
+        shown = [entry for entry in found if (entry.task, entry.demonstrations) == place][::-1]
+        for y, entry in enumerate(shown):
+            low, high = (100 * end for end in (entry.last_five.low, entry.last_five.high))
+            axis.plot([low, high], [y, y], color=OURS, alpha=0.35, linewidth=6, solid_capstyle="butt")
+            axis.plot(100 * entry.last_five.mean, y, "|", color=OURS, markersize=12, markeredgewidth=2)
+            axis.plot(100 * entry.best.mean, y, "o", color=OURS)
+            axis.plot(100 * entry.paper, y, "D", color=THEIRS, fillstyle="none")
+        axis.set_yticks(range(len(shown)), [entry.row.label for entry in shown], fontsize=9)
+        axis.set_ylim(-0.6, len(shown) - 0.4)
+        axis.set_xlim(-2, 102)
+        axis.set_xlabel("success, %", fontsize=9)
+    _legend(
+        figure,
+        [
+            {"marker": "o", "color": OURS, "label": "best checkpoint"},
+            {"marker": "|", "color": OURS, "markersize": 12, "label": "mean of the last five, 95 %"},
+            {"marker": "D", "color": THEIRS, "fillstyle": "none", "label": "paper (best)"},
+        ],
+    )
+    return figure
+
+
+def _angles(found: Sequence[Entry]) -> Figure:
+    figure, panels = _panels(found, 3.2)
+    for place, axis in panels.items():
+        series: dict[str, list[Entry]] = {}
+        for entry in found:
+            if (entry.task, entry.demonstrations) == place:
+                modality = "RGB" if entry.row.policy.get("modality") == "rgb" or "persp" in entry.row.name else "RGBD"
+                series.setdefault(f"{entry.row.label.split(',')[0]} ({modality})", []).append(entry)
+        for label, members in series.items():
+            is_oracle = "Oracle" in label
+            angles = [90.0 if is_oracle else entry.row.elevation_deg for entry in members]
+            estimates = [entry.last_five for entry in members]
+            rates = [100 * estimate.mean for estimate in estimates]
+            below = [100 * (estimate.mean - estimate.low) for estimate in estimates]
+            above = [100 * (estimate.high - estimate.mean) for estimate in estimates]
+            marker = "*" if is_oracle else "o"
+            axis.errorbar(angles, rates, yerr=[below, above], marker=marker, capsize=2, label=label)
+        axis.set_xlabel("camera's angle above the table, degrees", fontsize=9)
+        axis.set_ylabel("success, %, mean of the last five", fontsize=9)
+        axis.set_ylim(0, 100)
+        axis.legend(fontsize=7)
+    return figure
+
+
+def _curves(found: Sequence[Entry]) -> Figure:
+    figure, panels = _panels(found, 3.0)
+    for entry in found:
+        axis = panels[entry.task, entry.demonstrations]
+        steps, means, spreads = _mean_curve(entry.results)
+        (line,) = axis.plot(steps, means, marker=".", label=entry.row.label)
+        lower = [mean - spread for mean, spread in zip(means, spreads, strict=True)]
+        upper = [mean + spread for mean, spread in zip(means, spreads, strict=True)]
+        axis.fill_between(steps, lower, upper, color=line.get_color(), alpha=0.2)
+        axis.set_xlabel("environment steps", fontsize=9)
+        axis.set_ylabel("discounted return", fontsize=9)
+        axis.set_ylim(0, 1)
+        axis.legend(fontsize=7)
+    return figure
+
+
+def _mean_curve(results: Sequence[Result]) -> tuple[list[int], list[float], list[float]]:
+    """Return steps, mean returns and standard deviations over seeds, of the steps that all seeds reached."""
+    steps = [point.step for point in results[0].checkpoints]
+    columns = list(zip(*([point.mean_return for point in result.checkpoints] for result in results), strict=True))
+    return steps, [statistics.fmean(column) for column in columns], [statistics.pstdev(column) for column in columns]
+
+
+def _legend(figure: Figure, styles: list[dict[str, Any]]) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], linestyle="", **style) for style in styles]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)

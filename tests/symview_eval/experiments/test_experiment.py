@@ -1,0 +1,145 @@
+"""The command, whole, at the scale `smoke`."""
+
+import csv
+import json
+import shutil
+import sys
+
+import pytest
+from lerobot.scripts import lerobot_eval
+
+from lerobot_symview.cli import CommandError
+from symview_eval.experiments import cells as cells_module
+from symview_eval.experiments import experiment
+from symview_eval.experiments.experiment import ExperimentConfig, run_experiment
+from symview_eval.experiments.grid import EXPERIMENTS
+from symview_eval.experiments.report import ReportConfig, report
+from symview_eval.experiments.results import read_result
+
+
+def config(folder, **chosen):
+    chosen = {"scale": "smoke", "num_workers": 1} | chosen
+    return ExperimentConfig(results_dir=folder / "results", output_dir=folder / "output", **chosen)
+
+
+@pytest.fixture(scope="module")
+def table1(tmp_path_factory):
+    """Folder in which the whole of table 1 was run."""
+    folder = tmp_path_factory.mktemp("table1")
+    run_experiment("table1", config(folder, num_workers=2))
+    return folder
+
+
+@pytest.fixture
+def copied(table1, tmp_path):
+    """The same, to change."""
+    return shutil.copytree(table1, tmp_path / "table1")
+
+
+def test_every_cell_of_table_1_has_a_result(table1):
+    files = {path.relative_to(table1 / "results").parts for path in (table1 / "results").rglob("*.csv")}
+    experiment = EXPERIMENTS["table1"]
+    assert files == {
+        ("table1", "smoke", task, row.name, "1", "0.csv") for task in experiment.tasks for row in experiment.rows
+    }
+    for path in (table1 / "results").rglob("*.csv"):
+        result = read_result(path)
+        assert [(point.step, point.episodes) for point in result.checkpoints] == [(1, 1), (2, 1)]
+        assert result.times.cpu_s > 0
+        assert result.times.training_s <= result.origin.seconds
+
+
+def test_what_is_finished_is_not_run_again(copied, monkeypatch):
+    removed = sorted((copied / "results").rglob("*.csv"))[3]
+    content = read_result(removed).checkpoints
+    removed.unlink()
+    ran = []
+    run_cell = cells_module.run_cell
+    monkeypatch.setattr(cells_module, "run_cell", lambda job: ran.append(job.cell) or run_cell(job))
+    run_experiment("table1", config(copied))
+    assert [copied / "results" / cell.path for cell in ran] == [removed]
+    assert read_result(removed).checkpoints == content  # the same seed, the same run
+
+
+def test_lerobot_evaluates_what_a_cell_leaves(table1, tmp_path, monkeypatch):
+    policy = table1 / "output/policies/table1/smoke/block_picking/reproj_equi/1/0/pretrained_model"
+    arguments = [
+        "lerobot-eval",
+        f"--policy.path={policy}",
+        "--policy.device=cpu",
+        "--env.type=symview",
+        "--env.max_steps=2",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path}",
+    ]
+    monkeypatch.setattr(sys, "argv", arguments)
+    lerobot_eval.main()
+    assert json.loads((tmp_path / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+def test_the_report_has_every_row_and_needs_nothing_beside_it(table1, tmp_path):
+    page = report(ReportConfig(table1 / "results", tmp_path)).read_text()
+    assert "scale=" not in page
+    assert "name=smoke" in page
+    assert page.count("<td>Reproj. Equi</td>") == 5
+    assert 'src="data:image/png' in page
+    assert 'src="table1' not in page
+    assert (tmp_path / "table1_smoke.png").read_bytes().startswith(b"\x89PNG")
+    table = [line.split(" | ") for line in (tmp_path / "report.md").read_text().splitlines() if "Oracle Equi" in line]
+    assert len(table) == 5
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if name != "table1"])
+def test_every_experiment_runs_and_is_reported(name, tmp_path):
+    rows = [row.name for row in EXPERIMENTS[name].rows][:3:2]
+    task = "block_stacking"
+    run_experiment(name, config(tmp_path, tasks=[task], methods=rows))
+    assert len(list((tmp_path / "results" / name / "smoke" / task).rglob("0.csv"))) == len(rows)
+    page = report(ReportConfig(tmp_path / "results", tmp_path / "report"))
+    assert EXPERIMENTS[name].title in page.read_text()
+    assert (page.parent / f"{name}_smoke.png").is_file()
+
+
+def test_a_cell_that_fails_does_not_keep_others_from_running(tmp_path, monkeypatch):
+    clone = cells_module.clone
+
+    def fail_on_the_side(cell, *arguments):
+        if cell.row.name == "sideview_equi":
+            raise RuntimeError("out of memory")
+        return clone(cell, *arguments)
+
+    monkeypatch.setattr(cells_module, "clone", fail_on_the_side)
+    chosen = config(tmp_path, tasks=["block_picking"], methods=["sideview_equi", "sideview_nonequi"])
+    with pytest.raises(CommandError, match=r"1 of 2 cells failed.*sideview_equi on block_picking.*out of memory"):
+        run_experiment("table1", chosen)
+    (done,) = (tmp_path / "results").rglob("*.csv")
+    assert done.parts[-3] == "sideview_nonequi"
+    with done.open() as stream:
+        assert list(csv.DictReader(line for line in stream if not line.startswith("#")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["tabel1"], "did you mean 'table1'"),
+        ([], "expected one of: table1"),
+        (["table1", "--scale=tiny"], "--scale 'tiny'"),
+        (["table1", "--scale=smoke", "--tasks=[block_pulling]"], "'block_pulling'"),
+        (["table1", "--demos=[0]"], "--demos must be at least 1"),
+        (["table1", "--num_workers=0"], "--num_workers must be at least 1"),
+    ],
+)
+def test_wrong_use_is_answered_in_one_line(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["symview-experiment", *arguments])
+    with pytest.raises(SystemExit) as end:
+        experiment.main()
+    assert end.value.code == 2
+    *told, last = capsys.readouterr().err.splitlines()
+    assert message in last
+    assert "Traceback" not in "".join(told)
+
+
+def test_a_report_of_nothing_says_what_to_do(tmp_path):
+    with pytest.raises(CommandError, match="run symview-experiment table1 first"):
+        report(ReportConfig(tmp_path))

@@ -1,0 +1,98 @@
+import pytest
+
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from symview_eval.experiments.cloning import policy_config
+from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.summary import paper_values
+
+LAPTOP = SCALES["laptop"]
+
+
+def cells(name, scale=LAPTOP, **chosen):
+    return select(EXPERIMENTS[name], scale, **chosen)
+
+
+def only(name, task, method, demonstrations=10):
+    (cell,) = cells(name, tasks=[task], methods=[method], demos=[demonstrations], seeds=[0])
+    return cell
+
+
+@pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_row_is_a_policy(name, scale):
+    for row in EXPERIMENTS[name].rows:
+        cell = cells(name, scale, methods=[row.name])[0]
+        if cell.algorithm == "sacfd":
+            policy = SymviewSacfdConfig(device="cpu", **scale.policy, **row.policy)
+        else:
+            policy = policy_config(cell, "cpu")
+        assert policy.method == row.policy["method"]
+        assert policy.crop_size == scale.crop_size
+        if policy.is_computed and cell.algorithm == "bc":
+            (options,) = policy.computed_views.values()
+            assert options["size"] == policy.image_size
+            assert row.policy.get("view_options", {}).items() <= options.items()
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_names_of_results_are_unique(name):
+    chosen = cells(name)
+    assert len({cell.path for cell in chosen}) == len(chosen)
+
+
+@pytest.mark.parametrize("name", [name for name in EXPERIMENTS if paper_values(name)])
+def test_the_papers_values_are_those_of_the_table(name):
+    stated = set(paper_values(name))
+    computed = {(cell.task, cell.demonstrations, cell.row.name) for cell in cells(name, seeds=[0])}
+    missing = {("block_stacking", 50, "voxel_equi")} if name == "table1" else set()  # the paper prints a dash
+    assert stated == computed - missing
+
+
+def test_values_of_the_paper_are_as_printed():
+    assert paper_values("table1")["block_picking", 10, "reproj_equi"] == pytest.approx(0.847)
+    assert paper_values("table1")["block_in_bowl", 50, "sideview_nonequi"] == pytest.approx(0.45)
+    assert paper_values("table2")["block_stacking", 50, "persp_equi"] == pytest.approx(0.567)
+    assert paper_values("table3")["drawer_opening", 10, "persp_equi_relaxed"] == pytest.approx(0.631)
+    assert paper_values("table4")["block_stacking", 5, "reproj_equi_local"] == pytest.approx(0.06)
+    assert paper_values("table5")["block_in_bowl", 10, "persp_equi_broken_dynamic"] == pytest.approx(0.005)
+    assert not paper_values("figure7")
+
+
+def test_a_run_that_is_in_two_tables_is_one():
+    one = only("table1", "block_stacking", "reproj_equi").configuration_hash
+    assert one == only("table3", "block_stacking", "reproj_equi").configuration_hash
+    assert one == only("table4", "block_stacking", "reproj_equi").configuration_hash
+    assert one == only("figure7", "block_stacking", "reproj_equi_45deg").configuration_hash
+    assert one != only("figure7", "block_stacking", "reproj_equi_30deg").configuration_hash
+    assert one != only("table4", "block_stacking", "reproj_equi_local").configuration_hash
+
+
+def test_methods_learn_from_the_same_demonstrations():
+    chosen = cells("table1", tasks=["block_picking"], demos=[10], seeds=[0])
+    assert len(chosen) == 6
+    assert len({cell.recording for cell in chosen}) == 1
+
+
+def test_reinforcement_learning_has_the_papers_demonstrations_and_steps():
+    paper = {cell.task: cell for cell in cells("figure5", SCALES["paper"], seeds=[0])}
+    assert {task: (cell.demonstrations, 5 * cell.steps) for task, cell in paper.items()} == {
+        "block_picking": (20, 5000),
+        "block_pushing": (20, 5000),
+        "block_pulling": (20, 5000),
+        "drawer_opening": (20, 5000),
+        "block_stacking": (50, 10000),
+        "block_in_bowl": (50, 10000),
+    }
+
+
+@pytest.mark.parametrize(
+    ("chosen", "message"),
+    [
+        ({"tasks": ["block_piking"]}, "did you mean 'block_picking'"),
+        ({"methods": ["persp_equi"]}, "--methods entry 'persp_equi'"),
+    ],
+)
+def test_what_the_experiment_lacks_is_refused(chosen, message):
+    with pytest.raises(ValueError, match=message):
+        cells("table1", **chosen)

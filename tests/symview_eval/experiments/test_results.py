@@ -1,0 +1,64 @@
+import math
+
+import pytest
+
+from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.results import (
+    Checkpoint,
+    Origin,
+    Result,
+    Times,
+    finished,
+    read_result,
+    unfinished,
+    write_result,
+)
+from symview_eval.experiments.scale import SCALES
+
+SCALE = SCALES["laptop"]
+
+
+def result(configuration="0123456789abcdef", successes=(3, 17)):
+    checkpoints = [Checkpoint(200 * i, count, 20, 0.125 * i, 0.5) for i, count in enumerate(successes, start=1)]
+    return Result(Origin(configuration, "0.1.0", "Linux x86_64, 2 cores", 101.5, "cpu"), Times(1.0, 90.0), checkpoints)
+
+
+def cells(name):
+    return select(EXPERIMENTS[name], SCALE, ["block_stacking"], ["reproj_equi"], [10], [0])
+
+
+def test_a_result_survives_its_file(tmp_path):
+    path = tmp_path / "table1" / "0.csv"
+    write_result(path, result())
+    read = read_result(path)
+    assert (read.origin, read.checkpoints) == (result().origin, result().checkpoints)
+    assert read.times.training_s == 90.0
+    assert math.isnan(read.times.cpu_s)
+    assert [file.name for file in path.parent.iterdir()] == ["0.csv"]
+
+
+@pytest.mark.parametrize("text", ["", "step,successes\n1,2\n", "# configuration: a\nstep\nx\n"])
+def test_another_file_is_refused(text, tmp_path):
+    (tmp_path / "0.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"0.csv is not a result of symview-experiment"):
+        read_result(tmp_path / "0.csv")
+
+
+def test_a_finished_cell_is_not_run_again(tmp_path):
+    (cell,) = cells("table1")
+    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == [cell]
+    write_result(tmp_path / cell.path, result(cell.configuration_hash))
+    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == []
+
+
+def test_a_result_of_other_settings_is_run_again(tmp_path):
+    (cell,) = cells("table1")
+    write_result(tmp_path / cell.path, result("another"))
+    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == [cell]
+
+
+def test_the_result_of_another_table_is_taken_over(tmp_path):
+    (cell,), (same,) = cells("table1"), cells("table4")
+    write_result(tmp_path / cell.path, result(cell.configuration_hash))
+    assert list(unfinished([same], tmp_path, finished(tmp_path, SCALE.name))) == []
+    assert read_result(tmp_path / same.path).checkpoints == result().checkpoints

@@ -1,0 +1,74 @@
+import pytest
+
+from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.results import write_result
+from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.summary import entries, is_current, measured_scales, orderings
+
+from .test_results import result
+
+TABLE, SCALE = EXPERIMENTS["table1"], SCALES["laptop"]
+
+
+def write(folder, method, *seeds):
+    """A result of 10 demonstrations of block picking for every seed, each a list of successes of 20 episodes."""
+    for seed, successes in enumerate(seeds):
+        (cell,) = select(TABLE, SCALE, ["block_picking"], [method], [10], [seed])
+        write_result(folder / cell.path, result(cell.configuration_hash, successes))
+
+
+def test_best_last_and_mean_of_the_last_five(tmp_path):
+    write(tmp_path, "reproj_equi", [20, 2, 4, 6, 8, 10], [0, 2, 4, 16, 8, 10])
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert entry.best.mean == pytest.approx((1.0 + 0.8) / 2)
+    assert entry.last.mean == pytest.approx(0.5)
+    assert entry.last_five.mean == pytest.approx((30 / 100 + 40 / 100) / 2)
+    assert entry.episodes == 200
+    assert entry.paper == pytest.approx(0.847)
+    assert entry.difference == pytest.approx(0.9 - 0.847)
+
+
+def test_intervals_over_seeds_and_episodes(tmp_path):
+    write(tmp_path, "reproj_equi", [10], [12], [14])
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    half = 4.30265 * 0.1 / 3**0.5  # Student's, two degrees of freedom, standard deviation 0.1
+    assert (entry.best.low, entry.best.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
+    assert (entry.last.low, entry.last.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
+
+
+def test_seeds_that_agree_do_not_make_a_rate_certain(tmp_path):
+    write(tmp_path, "reproj_equi", [10], [10], [10])
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert entry.best.low == entry.best.high == 0.5
+    assert entry.last.low == pytest.approx(0.3774, abs=1e-3)  # Wilson, 30 of 60
+    assert entry.last.high == pytest.approx(0.6226, abs=1e-3)
+
+
+def test_one_seed_says_nothing_of_the_best(tmp_path):
+    write(tmp_path, "reproj_equi", [10])
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert str(entry.best) == "50.0"
+    assert str(entry.last) == "50.0 (30 to 70)"
+
+
+def test_orders_of_the_paper_are_compared(tmp_path):
+    write(tmp_path, "oracle_equi", [19])  # the paper: 77.8
+    write(tmp_path, "reproj_equi", [18])  # 84.7
+    write(tmp_path, "sideview_nonequi", [4])  # 56.2
+    pairs = orderings(entries(TABLE, "laptop", tmp_path))
+    assert {(pair.better.row.name, pair.worse.row.name, pair.found > 0) for pair in pairs} == {
+        ("reproj_equi", "oracle_equi", False),
+        ("reproj_equi", "sideview_nonequi", True),
+        ("oracle_equi", "sideview_nonequi", True),
+    }
+
+
+def test_results_of_other_settings_are_told_apart(tmp_path):
+    write(tmp_path, "reproj_equi", [10])
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert is_current(entry, TABLE, "laptop")
+    (cell,) = select(TABLE, SCALE, ["block_picking"], ["reproj_equi"], [10], [0])
+    write_result(tmp_path / cell.path, result("another"))
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert not is_current(entry, TABLE, "laptop")
+    assert measured_scales(TABLE, tmp_path) == ["laptop"]
