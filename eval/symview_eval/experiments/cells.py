@@ -126,7 +126,7 @@ def _run(job: Job, start: float) -> None:
 
 
 def _reinforce(cell: Cell, target: RecordedDataset, env: EnvSettings, output: Path, device: str) -> list[Checkpoint]:
-    """Run `symview-train-rl`, or go on with it, and return its evaluations, steps being the environments'."""
+    """Run `symview-train-rl`, or go on with it, and return its evaluations."""
     scale = cell.scale
     config = TrainRlConfig(
         dataset=target,
@@ -146,7 +146,7 @@ def _reinforce(cell: Cell, target: RecordedDataset, env: EnvSettings, output: Pa
     train_rl(config)
     return [
         Checkpoint(
-            step=RL_SIMULATORS * int(row["step"]),
+            step=int(row["step"]),
             successes=round(row["success"] * scale.eval_episodes),
             episodes=scale.eval_episodes,
             mean_return=row["return"],

@@ -98,7 +98,7 @@ def _curves(found: Sequence[Entry]) -> Figure:
         lower = [mean - spread for mean, spread in zip(means, spreads, strict=True)]
         upper = [mean + spread for mean, spread in zip(means, spreads, strict=True)]
         axis.fill_between(steps, lower, upper, color=line.get_color(), alpha=0.2)
-        axis.set_xlabel("environment steps", fontsize=9)
+        axis.set_xlabel("joint steps", fontsize=9)
         axis.set_ylabel("discounted return", fontsize=9)
         axis.set_ylim(0, 1)
         axis.legend(fontsize=7)

@@ -64,8 +64,8 @@ SCALES = {
             batch_size=128,
             eval_every=200,
             eval_episodes=100,
-            rl_steps=1000,  # 5,000 environment steps, five to an update (paper A.3)
-            rl_eval_every=40,
+            rl_steps=5000,
+            rl_eval_every=200,
             simulators=16,
             dtype="bfloat16",
         ),
