@@ -27,6 +27,7 @@ from lerobot_symview.derivation import (
 )
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, calibration_features, stored_workspace, view_features
+from lerobot_symview.hub import PushedDataset, push_dataset
 from lerobot_symview.source_dataset import EpisodeTables, SourceDataset
 from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
@@ -46,8 +47,10 @@ EXAMPLES = """\
 class AddViewsConfig:
     """Write a dataset again with views from above as new camera keys. The source is not modified."""
 
-    dataset: DatasetTarget
-    """The source: it must hold the camera's images, and its calibration unless `calibration` states it."""
+    dataset: PushedDataset
+    """The source: it must hold the camera's images, and its calibration unless `calibration` states it. What is said of
+    the Hub is of the result.
+    """
     new_repo_id: str = ""
     """Name of the result; by default that of the source with `_views` appended."""
     new_root: Path | None = None
@@ -86,11 +89,18 @@ class AddViewsConfig:
 
 
 def add_views(config: AddViewsConfig) -> Path:
-    """Write the dataset that `config` describes and return its folder.
+    """Write the dataset that `config` describes, upload it if asked, and return its folder.
 
     Every frame's views are computed from its own calibration, so a camera may move. Original columns are copied bit for
     bit and videos as files; statistics cover the new keys.
     """
+    folder = _write(config)
+    if config.dataset.push_to_hub:
+        push_dataset(config.target(), config.dataset)
+    return folder
+
+
+def _write(config: AddViewsConfig) -> Path:
     source, target = SourceDataset(config.dataset.folder()), config.target().folder()
     with EXECUTORS["local"](config.num_workers, "lerobot_symview.derivation") as executor:
         derivation = _plan(config, source, partial_folder(target))

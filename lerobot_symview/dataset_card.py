@@ -44,8 +44,8 @@ def dataset_card(dataset: SourceDataset, repo_id: str, tags: list[str], has_pict
         *(_image_row(key, feature) for key, feature in dataset.features.items() if _is_image(feature)),
         _calibration(dataset),
         "\n## State and action\n",
-        _entries(dataset, keys.STATE, "state"),
-        _entries(dataset, keys.ACTION, "action"),
+        _entries(dataset, keys.STATE),
+        _entries(dataset, keys.ACTION),
         "x and y are relative to the workspace's centre; lengths in metres, angles in radians, apertures in [0, 1].\n",
         _training(repo_id, dataset),
     ]
@@ -75,16 +75,18 @@ def _facts(dataset: SourceDataset) -> dict[str, Any]:
 def _recorded(facts: dict[str, Any]) -> str:
     if "task" not in facts:
         return ""
-    text = f" A scripted expert does the task `{facts['task']}` with a {facts['robot']} arm in PyBullet, seed {facts['seed']}."
+    sentences = [
+        f"A scripted expert does `{facts['task']}` with a {facts['robot']} arm in PyBullet, seed {facts['seed']}."
+    ]
     if "instruction" in facts:
-        text += f' The instruction is "{facts["instruction"]}"'
+        sentences.append(f'The instruction is "{facts["instruction"]}"')
     if facts.get("noise"):
-        text += (
-            f" Its motions are disturbed by {facts['noise']:g} of the largest; what is recorded is what it meant to do."
-        )
+        share = f"{facts['noise']:g} of the largest"
+        sentences.append(f"Its motions are disturbed by {share}; what is recorded is what it meant to do.")
     if "expert_success_rate" in facts:
-        text += f" The expert succeeded in {100 * facts['expert_success_rate']:.1f} % of its attempts; only successes are here."
-    return text
+        rate = f"{100 * facts['expert_success_rate']:.1f} %"
+        sentences.append(f"It succeeded in {rate} of its attempts; only successes are here.")
+    return " " + " ".join(sentences)
 
 
 def _image_row(key: str, feature: dict[str, Any]) -> str:
@@ -96,12 +98,14 @@ def _image_row(key: str, feature: dict[str, Any]) -> str:
         text = f"view `{symview['view']}` made from camera `{symview['camera']}` ({options})"
     elif "placement" in symview:
         place = symview["placement"]
-        text = f"camera `{place['name']}` at {place['elevation_deg']:g} degrees above the table, {place['distance']:g} m away"
+        angle, distance = f"{place['elevation_deg']:g} degrees", f"{place['distance']:g} m"
+        text = f"camera `{place['name']}`, {angle} above the table, {distance} away"
         if any(place["spread"].values()):
             text += ", elsewhere in every episode"
     else:
         text = "camera"
-    return f"| `{key}` | {height} x {width} | {text}{f'; {unit} ' if unit else ''} |"
+    measure = f", {'height' if 'view' in symview else 'depth'} in {unit}" if unit else ""
+    return f"| `{key}` | {height} x {width} | {text}{measure} |"
 
 
 def _calibration(dataset: SourceDataset) -> str:
@@ -117,23 +121,22 @@ def _calibration(dataset: SourceDataset) -> str:
     )
 
 
-def _entries(dataset: SourceDataset, key: str, name: str) -> str:
+def _entries(dataset: SourceDataset, key: str) -> str:
     feature = dataset.features.get(key)
     if feature is None:
         return ""
     names = feature.get("names")
-    return f"`{key}`: {', '.join(names) if isinstance(names, list) else f'{feature["shape"][0]} numbers'} ({name}).\n"
+    return f"`{key}`: {', '.join(names) if isinstance(names, list) else f'{feature["shape"][0]} numbers'}.\n"
 
 
 def _training(repo_id: str, dataset: SourceDataset) -> str:
     views = [(feature.get("info") or {}).get("symview", {}).get("view") for feature in dataset.features.values()]
     view = next((one for one in views if one), None)
     method = f" --policy.method={view}_equi" if view else ""
+    command = f"lerobot-train --dataset.repo_id={repo_id} --policy.type=symview_bc{method} --policy.push_to_hub=false"
     return (
-        "## Train on it\n\n```bash\n"
-        f"lerobot-train --dataset.repo_id={repo_id} --policy.type=symview_bc{method} --policy.push_to_hub=false\n```\n\n"
-        f"`--policy.type=symview_bc` is a policy of {REPOSITORY}, a plugin of LeRobot; other policies read the dataset "
-        "too.\n"
+        f"## Train on it\n\n```bash\n{command}\n```\n\n`symview_bc` is a policy of {REPOSITORY}, a plugin of LeRobot; "
+        "other policies read the dataset too.\n"
     )
 
 

@@ -27,6 +27,7 @@ from lerobot_symview.image_codec import decode_depth, decode_rgb
 from lerobot_symview.views import Frame, View
 from lerobot_symview.workspace import Workspace
 
+FORMAT = "v3.0"  # LeRobot's
 VIDEO_FRAMES = 64  # decoded at a time
 VIDEO_TOLERANCE = 1e-4  # seconds, LeRobot's own
 
@@ -48,8 +49,10 @@ class SourceDataset:
             raise CommandError(f"no dataset at {folder}: check --dataset.repo_id and --dataset.root")
         self.info: dict[str, Any] = json.loads(file.read_text())
         version = self.info.get("codebase_version")
-        if version != "v3.0":
-            raise CommandError(f"the dataset at {folder} has format {version}, expected v3.0: convert it with LeRobot")
+        if version != FORMAT:
+            raise CommandError(
+                f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot"
+            )
 
     @property
     def features(self) -> Features:

@@ -1,7 +1,9 @@
 """Shared fixtures: a tiny recorded dataset and the same with views, made once by the library itself."""
 
+import atexit
 import os
 import resource
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,11 +11,13 @@ from pathlib import Path
 
 # Hugging Face's libraries and numba read these when they are imported, which happens below.
 os.environ["HF_HUB_OFFLINE"] = "1"
-os.environ["HF_HOME"] = tempfile.mkdtemp(prefix="symview-hf-")
 os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
 # Compiled kernels check every index, and are kept apart from those that do not.
 os.environ["NUMBA_BOUNDSCHECK"] = "1"
-os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="symview-numba-")
+if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers share what the first process made
+    scratch = tempfile.mkdtemp(prefix="symview-tests-")
+    os.environ |= {"HF_HOME": f"{scratch}/huggingface", "NUMBA_CACHE_DIR": f"{scratch}/numba"}
+    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
 
 import numpy as np
 import pytest
@@ -21,10 +25,10 @@ from hypothesis import settings
 
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
-from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.hub import PushedDataset
 from lerobot_symview.workspace import Workspace
 from symview_sim.generate import GenerateConfig, generate
-from symview_sim.settings import RecordedDataset
+from symview_sim.settings import NewDataset
 
 # The same examples every time, so that a failure can be repeated; no time limit, since the first one compiles.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
@@ -43,7 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""
     folder = tmp_path_factory.mktemp("data") / "recorded"
-    return generate(GenerateConfig(RecordedDataset("test/recorded", folder), num_episodes=EPISODES))
+    return generate(GenerateConfig(NewDataset("test/recorded", folder), num_episodes=EPISODES))
 
 
 @pytest.fixture(scope="session")
@@ -51,7 +55,7 @@ def with_views(recorded: Path) -> Path:
     """Folder of the same dataset with both views added."""
     target = recorded.with_name("with_views")
     config = AddViewsConfig(
-        DatasetTarget("test/recorded", recorded),
+        PushedDataset("test/recorded", recorded),
         new_repo_id="test/with_views",
         new_root=target,
         views=["reproj", "persp"],
@@ -65,7 +69,7 @@ def only_views(recorded: Path) -> Path:
     """Folder of the same dataset with the reprojected view in place of the cameras' images."""
     target = recorded.with_name("only_views")
     config = AddViewsConfig(
-        DatasetTarget("test/recorded", recorded),
+        PushedDataset("test/recorded", recorded),
         new_repo_id="test/only_views",
         new_root=target,
         size=VIEW_SIZE,

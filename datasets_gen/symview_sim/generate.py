@@ -17,6 +17,7 @@ from lerobot_symview.camera import project
 from lerobot_symview.cli import run_command
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, camera_features
+from lerobot_symview.hub import push_dataset
 from lerobot_symview.names import lookup
 from lerobot_symview.staging import is_complete, open_partial, partial_folder
 from symview_sim.env import SymviewEnv
@@ -29,7 +30,7 @@ from symview_sim.recording import (
     recorded_attempts,
     write_shard,
 )
-from symview_sim.settings import EnvSettings, RecordedDataset
+from symview_sim.settings import EnvSettings, NewDataset
 
 logger = logging.getLogger(__name__)
 
@@ -37,6 +38,7 @@ EXAMPLES = """\
   symview-generate --dataset.repo_id=me/picking --env.task=block_picking --num_episodes=50
   symview-generate --env.task=drawer_opening --num_episodes=20 --num_workers=2 --root=data/drawer
   symview-generate --root=data/anywhere --env.camera.spread.azimuth_deg=180 --env.camera.spread.elevation_deg=20
+  symview-generate --dataset.repo_id=me/picking --dataset.push_to_hub=true --dataset.private=true
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
 
@@ -52,7 +54,7 @@ class RecordedEnv(EnvSettings):
 class GenerateConfig:
     """Let a task's expert demonstrate it and record what the cameras see."""
 
-    dataset: RecordedDataset = field(default_factory=RecordedDataset)
+    dataset: NewDataset = field(default_factory=NewDataset)
     """Where the dataset goes; `--root` is short for `--dataset.root`."""
     env: RecordedEnv = field(default_factory=RecordedEnv)
     """What is demonstrated, and which cameras see it."""
@@ -87,7 +89,14 @@ class GenerateConfig:
 
 
 def generate(config: GenerateConfig) -> Path:
-    """Write the dataset that `config` describes and return its folder."""
+    """Write the dataset that `config` describes, upload it if asked, and return its folder."""
+    folder = _write(config)
+    if config.dataset.push_to_hub:
+        push_dataset(config.dataset, config.dataset)
+    return folder
+
+
+def _write(config: GenerateConfig) -> Path:
     target = config.dataset.folder()
     recording = _plan(config, target)
     if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.hub import HubOptions
 from lerobot_symview.names import lookup
 from lerobot_symview.placement import CameraSpec
 from symview_sim.robots import ROBOTS
@@ -64,7 +65,12 @@ class EnvSettings:
 
 @dataclass(frozen=True)
 class RecordedDataset(DatasetTarget):
-    """Where demonstrations are, or go."""
+    """Where demonstrations are."""
 
     repo_id: str = "symview/demonstrations"
     """`user/name`, its name on the Hub."""
+
+
+@dataclass(frozen=True)
+class NewDataset(HubOptions, RecordedDataset):
+    """Where demonstrations go."""

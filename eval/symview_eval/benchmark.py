@@ -22,7 +22,7 @@ from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
 from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import EnvSettings, RecordedDataset
+from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.tasks import TASK_NAMES
 
 REPEATS = 50
@@ -147,7 +147,7 @@ def _saved_per_second(config: EnvBenchmark) -> float:
 
     recorded = RecordedEnv(**vars(config.env))
     with tempfile.TemporaryDirectory() as folder:
-        target = RecordedDataset("benchmark/recorded", Path(folder) / "recorded")
+        target = NewDataset("benchmark/recorded", Path(folder) / "recorded")
         start = time.perf_counter()
         generate(GenerateConfig(target, env=recorded, num_episodes=config.episodes))
         return config.episodes / (time.perf_counter() - start)

@@ -23,9 +23,9 @@ from lerobot_policy_symview.encoders import ImageEncoder
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import RecordedDataset
+from symview_sim.settings import NewDataset
 
 LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
 PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"
@@ -207,11 +207,11 @@ def _loading_seconds(config: PolicyBenchmark) -> float:
 
     with tempfile.TemporaryDirectory() as folder:
         recorded, views = Path(folder) / "recorded", Path(folder) / "views"
-        target = RecordedDataset("benchmark/recorded", recorded)
+        target = NewDataset("benchmark/recorded", recorded)
         generate(GenerateConfig(target, env=RecordedEnv(), num_episodes=LOADED_EPISODES))
         add_views(
             AddViewsConfig(
-                DatasetTarget("benchmark/recorded", recorded),
+                PushedDataset("benchmark/recorded", recorded),
                 new_repo_id="benchmark/views",
                 new_root=views,
                 size=config.crop_size + MARGIN,

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from symview_eval.clock import seconds
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import EnvSettings, RecordedDataset
+from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.simulators import Reset, Simulators, Step
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
     from lerobot_policy_symview.rl.training import Training
 
     with tempfile.TemporaryDirectory() as folder:
-        target = RecordedDataset("benchmark/recorded", Path(folder) / "recorded")
+        target = NewDataset("benchmark/recorded", Path(folder) / "recorded")
         generate(GenerateConfig(target, env=RecordedEnv(**vars(config.env)), num_episodes=DEMONSTRATIONS))
         training_config = TrainRlConfig(
             dataset=target,

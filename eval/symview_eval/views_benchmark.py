@@ -19,14 +19,14 @@ import pyarrow.parquet as pq
 
 from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.hub import PushedDataset
 from lerobot_symview.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.perspective import image_from_topdown
 from lerobot_symview.source_dataset import SourceDataset
 from lerobot_symview.views import Frame, make_view
 from symview_eval.clock import Clock, seconds
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import EnvSettings, RecordedDataset
+from symview_sim.settings import EnvSettings, NewDataset
 
 BATCH = 64  # frames on a GPU
 NOISE = 2.0  # levels of 255, standard deviation: a webcam indoors
@@ -183,7 +183,7 @@ def _offline(frames: int) -> dict[str, float]:
 
         def add(dataset: Path, target: str, num_workers: int = 1) -> float:
             config = AddViewsConfig(
-                DatasetTarget("benchmark/source", dataset),
+                PushedDataset("benchmark/source", dataset),
                 new_root=folder / target,
                 views=["reproj", "persp"],
                 num_workers=num_workers,
@@ -207,7 +207,7 @@ def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
     """Return a recorded dataset with a real camera's noise, and one that repeats it to at least `frames` frames."""
     from lerobot.datasets import aggregate_datasets
 
-    target = RecordedDataset("benchmark/recorded", folder / "recorded")
+    target = NewDataset("benchmark/recorded", folder / "recorded")
     recorded = generate(GenerateConfig(target, env=RecordedEnv(oracle=False), num_episodes=RECORDED))
     for file in sorted((recorded / "data").rglob("*.parquet")):
         _add_noise(file, keys.rgb("side"))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from huggingface_hub import ModelCard
 from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -19,6 +20,7 @@ from lerobot_policy_symview.clouds import cloud_from_depth
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
 from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.groups import make_group
+from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.point_encoder import POINTS
 from lerobot_policy_symview.processor_views import metres
 from lerobot_policy_symview.state_input import StateInput, camera_directions
@@ -108,6 +110,28 @@ class SymviewPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Nothing is remembered between steps."""
+
+    @property
+    def parameter_count(self) -> int:
+        """How many numbers are trained."""
+        return sum(parameter.numel() for parameter in self.network.parameters())
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: Any = None,
+        dataset_meta: Any = None,
+    ) -> ModelCard:
+        """Return the card that `lerobot-train` pushes with the policy."""
+        training = {} if cfg is None else {"steps": cfg.steps, "batches of": cfg.batch_size, "seed": cfg.seed}
+        if dataset_meta is not None:
+            training = {"episodes": dataset_meta.total_episodes, "frames": dataset_meta.total_frames} | training
+        card = model_card(self.config, self.parameter_count, dataset_repo_id, training, tags=tags or ())
+        card.validate()
+        return card
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return actions (B, 1, A): dx, dy, dz in metres, dyaw in radians, aperture, in the declared order."""

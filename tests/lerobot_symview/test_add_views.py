@@ -13,12 +13,13 @@ from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.calibration import Calibration, parse_calibration, plain_calibration
 from lerobot_symview.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
 from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_symview.hub import PushedDataset
 from lerobot_symview.placement import CameraSpec, CameraSpread
 from lerobot_symview.source_dataset import vectors
 from lerobot_symview.views import VIEWS, Frame, make_view
 from lerobot_symview.workspace import Workspace
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import RecordedDataset
+from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
 from tests.lerobot_symview.derived import contents, views_config
 from tests.lerobot_symview.test_upsampling import plane_depth
@@ -99,7 +100,7 @@ def test_keep_drops_the_other_images(only_views):
 def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, with_views):
     before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
     with pytest.raises(CommandError, match="exists already"):
-        add_views(AddViewsConfig(DatasetTarget("test/recorded", recorded), new_root=with_views))
+        add_views(AddViewsConfig(PushedDataset("test/recorded", recorded), new_root=with_views))
     assert {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()} == before
 
 
@@ -113,7 +114,7 @@ def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, wit
 )
 def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, options, error, message):
     target = tmp_path / "target"
-    config = AddViewsConfig(**({"dataset": DatasetTarget("test/recorded", recorded), "new_root": target} | options))
+    config = AddViewsConfig(**({"dataset": PushedDataset("test/recorded", recorded), "new_root": target} | options))
     with pytest.raises(error, match=message):
         add_views(config)
     assert list(tmp_path.iterdir()) == []
@@ -129,7 +130,7 @@ def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
     env = RecordedEnv(camera=CameraSpec(height=64, width=64), oracle=False)
     folders = {}
     for video in (False, True):
-        target = RecordedDataset("test/recorded", tmp_path / f"source-{video}")
+        target = NewDataset("test/recorded", tmp_path / f"source-{video}")
         source = generate(GenerateConfig(target, env=env, num_episodes=2, video=video))
         folders[video] = add_views(views_config(source, tmp_path / f"views-{video}"))
     copied = {path: data for path, data in contents(folders[True]).items() if path.suffix == ".mp4"}
@@ -176,7 +177,7 @@ def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
 def test_a_camera_that_moves_is_followed(tmp_path):
     camera = CameraSpec(height=64, width=64, spread=CameraSpread(azimuth_deg=180.0, elevation_deg=20.0))
     env = RecordedEnv(camera=camera, oracle=False)
-    target = RecordedDataset("test/recorded", tmp_path / "moving")
+    target = NewDataset("test/recorded", tmp_path / "moving")
     source = LeRobotDataset("test/moving", root=generate(GenerateConfig(target, env=env, num_episodes=2)))
     result = LeRobotDataset("test/v", root=add_views(views_config(tmp_path / "moving", tmp_path / "derived")))
     key = keys.world_from_cam("side")
@@ -269,4 +270,4 @@ def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
 @pytest.mark.parametrize("views", [[], ["reprojection"]])
 def test_unknown_views_are_refused_before_anything_is_read(views):
     with pytest.raises(ValueError, match=r"view"):
-        AddViewsConfig(DatasetTarget("a/b"), views=views)
+        AddViewsConfig(PushedDataset("a/b"), views=views)

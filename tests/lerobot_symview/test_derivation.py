@@ -86,7 +86,7 @@ for _ in sys.stdin:
     if child == 0:
         derivation.PART_FRAMES = 1
         add_views.add_views(add_views.AddViewsConfig(
-            DatasetTarget('test/recorded', source), new_repo_id='test/derived', new_root=target,
+            PushedDataset('test/recorded', source), new_repo_id='test/derived', new_root=target,
             views=['reproj', 'persp'], size={VIEW_SIZE}, resume=True))
         os._exit(0)
     print(child, flush=True)

@@ -20,7 +20,7 @@ from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import RecordedDataset
+from symview_sim.settings import NewDataset
 from tests.conftest import EPISODES, largest_file
 
 SMALL = RecordedEnv(camera=CameraSpec(height=32, width=32), oracle=False)
@@ -29,7 +29,7 @@ COMMAND = Path(sys.executable).parent / "symview-generate"
 
 def config(root, **options):
     defaults = {"env": SMALL, "num_episodes": 5}
-    return GenerateConfig(RecordedDataset("test/small", root), **(defaults | options))
+    return GenerateConfig(NewDataset("test/small", root), **(defaults | options))
 
 
 def assert_same_data(folder, other):
@@ -243,7 +243,7 @@ def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
 
 def test_an_existing_dataset_is_not_overwritten(recorded):
     with pytest.raises(CommandError, match="exists already"):
-        generate(GenerateConfig(RecordedDataset("test/recorded", recorded), num_episodes=1))
+        generate(GenerateConfig(NewDataset("test/recorded", recorded), num_episodes=1))
 
 
 def test_a_refused_request_leaves_nothing_behind(tmp_path):
@@ -255,7 +255,7 @@ def test_a_refused_request_leaves_nothing_behind(tmp_path):
 @pytest.mark.parametrize("options", [{"num_episodes": 0}, {"noise": 2.0}, {"seed": -1}, {"num_workers": 0}])
 def test_impossible_requests_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
-        GenerateConfig(RecordedDataset("a/b"), **options)
+        GenerateConfig(NewDataset("a/b"), **options)
 
 
 def _begun(folder, **options):

@@ -23,7 +23,7 @@ from symview_eval.experiments.cloning import clone
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import EnvSettings, RecordedDataset
+from symview_sim.settings import EnvSettings, NewDataset
 
 logger = logging.getLogger(__name__)
 
@@ -125,7 +125,7 @@ def _run(job: Job, start: float) -> None:
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
 
 
-def _reinforce(cell: Cell, target: RecordedDataset, env: EnvSettings, output: Path, device: str) -> list[Checkpoint]:
+def _reinforce(cell: Cell, target: NewDataset, env: EnvSettings, output: Path, device: str) -> list[Checkpoint]:
     """Run `symview-train-rl`, or go on with it, and return its evaluations."""
     scale = cell.scale
     config = TrainRlConfig(
@@ -160,8 +160,8 @@ def _recordings(folder: Path) -> Path:
     return folder / "recordings"
 
 
-def _dataset(recordings: Path, name: str) -> RecordedDataset:
-    return RecordedDataset(f"symview/{name}", recordings / name)
+def _dataset(recordings: Path, name: str) -> NewDataset:
+    return NewDataset(f"symview/{name}", recordings / name)
 
 
 def _machine(device: str) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
 
 import draccus
 import numpy as np
+from huggingface_hub import HfApi
 from lerobot.common.train_utils import get_step_checkpoint_dir, update_last_checkpoint
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
@@ -19,10 +21,15 @@ from lerobot.utils.constants import (
 from lerobot.utils.random_utils import load_rng_state, save_rng_state
 from safetensors.torch import load_model
 
+from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.training import Episode, Interval, Training
 from lerobot_symview.cli import CommandError
+from lerobot_symview.hub import hub_errors
 from lerobot_symview.staging import part_of
+
+logger = logging.getLogger(__name__)
 
 CONFIGURATION, STATE, REPLAY = "train_config.json", "state.json", "replay"
 FREE = ("resume", "wandb", "output_dir")  # what may differ when a run is resumed
@@ -59,6 +66,27 @@ def save_checkpoint(training: Training, run_id: str | None) -> Path:
         if older.parent.parent.resolve() != folder.resolve():
             shutil.rmtree(older)
     return folder
+
+
+def push_policy(training: Training, checkpoint: Path) -> None:
+    """Upload a checkpoint's policy with its card to the Hub.
+
+    Raises:
+        CommandError: if that fails; the checkpoint stays as it is.
+    """
+    config, run = training.policy.config, training.config
+    told = {"updates": training.step, "batches of": run.batch_size, "simulators": run.num_simulators, "seed": run.seed}
+    evaluation = run.output_dir / "evaluation.csv"
+    rows = read_table(evaluation) if evaluation.exists() else []
+    card = model_card(config, training.policy.parameter_count, run.dataset.repo_id, told, rows, config.tags or ())
+    model = checkpoint / PRETRAINED_MODEL_DIR
+    card.save(model / "README.md")
+    with hub_errors(config.repo_id, "--policy.repo_id", model):
+        card.validate()
+        api = HfApi()
+        address = api.create_repo(config.repo_id, private=config.private, exist_ok=True)
+        api.upload_folder(repo_id=config.repo_id, folder_path=model)
+    logger.info("pushed to %s", address)
 
 
 def restore(training: Training, folder: Path) -> str | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from lerobot_policy_symview.demonstrations import open_dataset
-from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, restore, save_checkpoint
+from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, push_policy, restore, save_checkpoint
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.learner import MEASURES
 from lerobot_policy_symview.rl.records import Records
@@ -23,7 +23,8 @@ EXAMPLES = """\
   symview-train-rl --env.task=block_picking --policy.method=reproj_equi --dataset.root=data/picking
   symview-train-rl --dataset.root=data/picking --policy.method=sideview_nonequi --output_dir=outputs/sideview
   symview-train-rl --dataset.root=data/picking --policy.width=16 --policy.crop_size=64 --batch_size=32
-  symview-train-rl --dataset.root=data/picking --resume=true"""
+  symview-train-rl --dataset.root=data/picking --resume=true
+  symview-train-rl --dataset.root=data/picking --policy.repo_id=me/picker"""
 
 
 def train_rl(config: TrainRlConfig) -> Path:
@@ -58,6 +59,8 @@ def train_rl(config: TrainRlConfig) -> Path:
                     checkpoint, saved = save_checkpoint(training, records.run_id), training.step
             if checkpoint is None or saved != training.step:
                 checkpoint = save_checkpoint(training, records.run_id)
+        if config.policy.push_to_hub and config.policy.repo_id and not interruptions:
+            push_policy(training, checkpoint)
     if interruptions:
         logger.info("stopped at step %d: the same command with --resume=true goes on from there", training.step)
         raise KeyboardInterrupt

@@ -9,7 +9,7 @@ from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.train_rl import train_rl
 from symview_sim.generate import GenerateConfig, generate
-from symview_sim.settings import RecordedDataset
+from symview_sim.settings import NewDataset, RecordedDataset
 
 
 def learning_curve(data, folder, method):
@@ -33,7 +33,7 @@ def learning_curve(data, folder, method):
 @pytest.mark.slow
 def test_twenty_demonstrations_suffice_and_symmetry_learns_sooner(tmp_path):
     """Block picking; docs/reinforcement.md has the rates that were measured."""
-    data = generate(GenerateConfig(RecordedDataset("test/picking", tmp_path / "data"), num_episodes=20))
+    data = generate(GenerateConfig(NewDataset("test/picking", tmp_path / "data"), num_episodes=20))
     symmetric = learning_curve(data, tmp_path / "symmetric", "reproj_equi")
     plain = learning_curve(data, tmp_path / "plain", "sideview_nonequi")
     assert len(symmetric) == len(plain) == 4

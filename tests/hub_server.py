@@ -1,0 +1,446 @@
+"""A Hugging Face Hub on loopback, in memory, for the real `huggingface_hub` client and for LeRobot on top of it.
+
+    with HubServer() as hub, online(hub, ALICE):  # the client of this process
+        HfApi().create_repo("alice/demo", repo_type="dataset")
+    with HubServer() as hub:  # that of another process
+        subprocess.run(command, env=os.environ | hub.environment(ALICE))
+
+Both ways work. The client reads HF_ENDPOINT and HF_HUB_OFFLINE once, when it is imported, and modules keep copies.
+`online` therefore changes neither the endpoint nor its copies: the client goes on writing to https://huggingface.co,
+and its HTTP transport delivers that here; the server calls itself what the client calls it. Another process gets the
+variables before it imports anything; there, `RepoCard.validate` (in LeRobot's `push_to_hub`) still asks the real Hub,
+whose address it spells out, and a broken upload is repeated for 23 s before it fails.
+
+Unlike the Hub, this server sends the files of LFS itself, without a redirect, sends files whole whatever range is asked
+for, lists everything on one page, accepts every card, and gates nothing. Requests that are not here are answered with
+501: Xet, pull requests, spaces, and copies, moves and settings of repositories, among others.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+import secrets
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest import mock
+from urllib.parse import parse_qs, unquote, urlsplit
+
+ALICE, BOB = "hf_alice", "hf_bob"  # tokens of the users there are by default
+LFS_SUFFIXES = (".parquet", ".safetensors", ".png", ".mp4")
+LFS_SIZE = 1_000_000  # a larger file goes to LFS whatever its name
+GITATTRIBUTES = "".join(f"*{suffix} filter=lfs diff=lfs merge=lfs -text\n" for suffix in LFS_SUFFIXES)
+
+
+class HubError(Exception):
+    """An answer other than 200; `code` is what the client tells its exceptions by."""
+
+    def __init__(
+        self, status: int, message: str, code: str = "", headers: dict[str, str] | None = None, **body: Any
+    ) -> None:
+        super().__init__(message)
+        self.status = status
+        self.headers = {"X-Error-Message": message} | ({"X-Error-Code": code} if code else {}) | (headers or {})
+        self.body = {"error": message} | body
+
+
+@dataclass(frozen=True)
+class Blob:
+    """A file's content; git itself holds only a pointer to one that is in LFS."""
+
+    content: bytes
+    is_lfs: bool = False
+
+    @cached_property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.content).hexdigest()
+
+    @cached_property
+    def pointer(self) -> bytes:
+        size = len(self.content)
+        return f"version https://git-lfs.github.com/spec/v1\noid sha256:{self.sha256}\nsize {size}\n".encode()
+
+    @cached_property
+    def oid(self) -> str:
+        return git_hash(self.pointer if self.is_lfs else self.content)
+
+    @property
+    def etag(self) -> str:
+        """What the client compares with its own file."""
+        return self.sha256 if self.is_lfs else self.oid
+
+
+@dataclass(frozen=True)
+class Commit:
+    """A state of all files; the same history has the same `oid` on every server."""
+
+    files: dict[str, Blob]
+    title: str
+    parent: Commit | None = None
+
+    @cached_property
+    def oid(self) -> str:
+        tree = {path: blob.oid for path, blob in self.files.items()}
+        return git_hash(json.dumps([self.parent and self.parent.oid, self.title, tree], sort_keys=True).encode())
+
+
+@dataclass
+class Repo:
+    """A model's or a dataset's repository."""
+
+    kind: str
+    repo_id: str
+    private: bool
+    branches: dict[str, Commit] = field(default_factory=dict)
+    tags: dict[str, Commit] = field(default_factory=dict)
+    commits: dict[str, Commit] = field(default_factory=dict)
+    objects: dict[str, bytes] = field(default_factory=dict)  # of LFS, by SHA-256, committed or not
+
+    def __post_init__(self) -> None:
+        self.add("main", Commit({".gitattributes": Blob(GITATTRIBUTES.encode())}, "initial commit"))
+
+    def add(self, branch: str, commit: Commit) -> None:
+        self.branches[branch] = self.commits[commit.oid] = commit
+
+    def at(self, revision: str) -> Commit:
+        for commits in (self.branches, self.tags, self.commits):
+            if revision in commits:
+                return commits[revision]
+        raise HubError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+
+
+class HubServer(ThreadingHTTPServer):
+    """The server; it runs inside `with`, and forgets everything after it.
+
+    Attributes:
+        url: Its address, for `HF_ENDPOINT` or `HfApi(endpoint=...)`.
+        users: Of every token, the user's name and the namespaces that it may write to.
+        repos: Repositories by kind (`model` or `dataset`) and id.
+        requests: Method and path of every request, without its query.
+        lfs_uploads: SHA-256 of every object that was received, in that order.
+        fail_uploads_after: Once so many objects were received in all, connections of further uploads break.
+    """
+
+    request_queue_size = 64  # the client connects from many threads at once
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.url = f"http://127.0.0.1:{self.server_port}"
+        self.users: dict[str, tuple[str, set[str]]] = {ALICE: ("alice", {"alice"}), BOB: ("bob", {"bob"})}
+        self.repos: dict[tuple[str, str], Repo] = {}
+        self.requests: list[tuple[str, str]] = []
+        self.lfs_uploads: list[str] = []
+        self.fail_uploads_after: int | None = None
+        self.lock = threading.Lock()
+        self.signed: dict[str, tuple[Repo, str]] = {}  # objects to be uploaded, by an address nobody can guess
+        self.thread = threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True)
+
+    def __enter__(self) -> HubServer:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.shutdown()
+        self.server_close()
+        self.thread.join()
+
+    def files(self, repo_id: str, kind: str = "dataset", revision: str = "main") -> dict[str, bytes]:
+        """Content of every file of a revision."""
+        return {path: blob.content for path, blob in self.repos[kind, repo_id].at(revision).files.items()}
+
+    def environment(self, token: str | None) -> dict[str, str]:
+        """Variables that turn another process to this server."""
+        off = {"HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
+        return off | {"HF_ENDPOINT": self.url, "HF_TOKEN": token or "", "no_proxy": "127.0.0.1"}
+
+
+ROUTES: list[tuple[str, re.Pattern[str], bool, Callable[..., Any]]] = []
+API = r"/api/(?P<kind>model|dataset)s/(?P<repo_id>[^/]+/[^/]+)"
+WEB = r"/(?P<kind>datasets/)?(?P<repo_id>[^/]+/[^/]+)"
+REVISION = r"(?P<revision>[^/]+)"
+
+
+def route(method: str, pattern: str, write: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Let a function answer requests; one whose pattern names a repository gets it if the caller may see it."""
+
+    def register(function: Callable[..., Any]) -> Callable[..., Any]:
+        ROUTES.append((method, re.compile(pattern), write, function))
+        return function
+
+    return register
+
+
+def git_hash(content: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: HubServer
+    protocol_version = "HTTP/1.1"  # connections stay open, as the client expects
+    wbufsize = -1  # headers and body leave together, without the wait for an acknowledgement between them
+
+    def answer(self) -> None:
+        address = urlsplit(self.path)
+        self.query = parse_qs(address.query)
+        self.body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        status, headers = 200, {}
+        with self.server.lock:
+            self.server.requests.append((self.command, address.path))
+            try:
+                reply = self.dispatch(address.path)
+            except HubError as error:
+                status, headers, reply = error.status, error.headers, error.body
+            except ConnectionAbortedError:
+                self.close_connection = True
+                return
+        if isinstance(reply, tuple):
+            content, headers = reply
+        else:
+            content, headers = json.dumps(reply).encode(), headers | {"Content-Type": "application/json"}
+        self.send_response(status)
+        for name, value in (headers | {"Content-Length": str(len(content))}).items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
+
+    do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = answer  # noqa: N815
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+    def dispatch(self, path: str) -> Any:
+        token = self.headers.get("Authorization", "").removeprefix("Bearer ")
+        if token and token not in self.server.users:
+            raise HubError(401, "Invalid credentials in Authorization header")
+        self.user, self.namespaces = self.server.users.get(token, (None, set()))
+        for method, pattern, write, function in ROUTES:
+            match = pattern.fullmatch(path)
+            if match and method == self.command.replace("HEAD", "GET"):
+                named = {name: unquote(value or "") for name, value in match.groupdict().items()}
+                if "repo_id" in named:
+                    kind = named.pop("kind").removesuffix("s/") or "model"
+                    named["repo"] = self.repo(kind, named.pop("repo_id"), write)
+                return function(self, **named)
+        raise HubError(501, f"{self.command} {path} is not part of this server")
+
+    def repo(self, kind: str, repo_id: str, write: bool) -> Repo:
+        """A repository that the caller may see; a private one is not there for others."""
+        repo, owner = self.server.repos.get((kind, repo_id)), repo_id.split("/")[0]
+        if repo is None or (repo.private and owner not in self.namespaces | {self.user}):
+            raise HubError(404 if self.user else 401, "Repository not found", "RepoNotFound")
+        if write:
+            self.check_write(owner)
+        return repo
+
+    def check_write(self, namespace: str) -> None:
+        if self.user is None:
+            raise HubError(401, "Invalid username or password.")
+        if namespace not in self.namespaces:
+            raise HubError(403, f'You don\'t have the rights to write under the namespace "{namespace}"')
+
+    @property
+    def origin(self) -> str:
+        host = self.headers["Host"]
+        return f"https://{host}" if host == "huggingface.co" else f"http://{host}"
+
+    def address(self, repo: Repo) -> str:
+        return f"{self.origin}/{'datasets/' if repo.kind == 'dataset' else ''}{repo.repo_id}"
+
+    @route("GET", "/api/whoami-v2")
+    def whoami(self) -> Any:
+        if self.user is None:
+            raise HubError(401, "Invalid username or password.")
+        organizations = [{"type": "org", "name": name} for name in sorted(self.namespaces - {self.user})]
+        role = "write" if self.namespaces else "read"
+        auth = {"type": "access_token", "accessToken": {"displayName": "test", "role": role}}
+        return {"type": "user", "name": self.user, "fullname": self.user, "orgs": organizations, "auth": auth}
+
+    @route("POST", "/api/validate-yaml")
+    def validate_card(self) -> Any:
+        return {"errors": [], "warnings": []}
+
+    @route("POST", "/api/repos/create")
+    def create_repo(self) -> Any:
+        wanted = json.loads(self.body)
+        namespace, kind = wanted.get("organization") or self.user, wanted.get("type", "model")
+        self.check_write(namespace)
+        if kind not in ("model", "dataset"):
+            raise HubError(501, f"A {kind} is not part of this server")
+        repo = Repo(kind, f"{namespace}/{wanted['name']}", wanted.get("visibility") == "private")
+        if (kind, repo.repo_id) in self.server.repos:
+            raise HubError(409, f"You already created this {kind} repo", url=self.address(repo))
+        self.server.repos[kind, repo.repo_id] = repo
+        return {"url": self.address(repo), "name": repo.repo_id}
+
+    @route("GET", f"{API}(?:/revision/{REVISION})?")
+    def info(self, repo: Repo, revision: str) -> Any:
+        commit = repo.at(revision or "main")
+        siblings = [{"rfilename": path} for path in sorted(commit.files)]
+        return {"id": repo.repo_id, "sha": commit.oid, "private": repo.private, "tags": [], "siblings": siblings}
+
+    @route("GET", f"{API}/refs")
+    def refs(self, repo: Repo) -> Any:
+        branches, tags = (
+            [{"name": name, "ref": f"refs/{kind}/{name}", "targetCommit": commit.oid} for name, commit in refs.items()]
+            for kind, refs in (("heads", repo.branches), ("tags", repo.tags))
+        )
+        return {"branches": branches, "tags": tags, "converts": []}
+
+    @route("GET", f"{API}/tree/{REVISION}(?:/(?P<folder>.+))?")
+    def tree(self, repo: Repo, revision: str, folder: str) -> Any:
+        prefix = f"{folder}/" if folder else ""
+        inside = {path: blob for path, blob in repo.at(revision).files.items() if path.startswith(prefix)}
+        if not inside:
+            raise HubError(404, f"{folder} does not exist on {revision}", "EntryNotFound")
+        parents = {parent.as_posix() for path in inside for parent in Path(path).parents}
+        entries: list[dict[str, Any]] = [
+            {"type": "directory", "path": path, "oid": git_hash(path.encode()), "size": 0}
+            for path in sorted(parents - {"."})
+            if path.startswith(prefix)
+        ]
+        for path, blob in sorted(inside.items()):
+            entry = {"type": "file", "path": path, "oid": blob.oid, "size": len(blob.content)}
+            lfs = {"oid": blob.sha256, "size": len(blob.content), "pointerSize": len(blob.pointer)}
+            entries.append(entry | ({"lfs": lfs} if blob.is_lfs else {}))
+        recursive = self.query.get("recursive") == ["true"]
+        return [entry for entry in entries if recursive or "/" not in entry["path"].removeprefix(prefix)]
+
+    @route("GET", f"{WEB}/resolve/{REVISION}/(?P<path>.+)")
+    def resolve(self, repo: Repo, revision: str, path: str) -> Any:
+        commit = repo.at(revision)
+        headers = {"X-Repo-Commit": commit.oid}
+        if path not in commit.files:
+            raise HubError(404, "Entry not found", "EntryNotFound", headers)
+        blob = commit.files[path]
+        return blob.content, headers | {"ETag": f'"{blob.etag}"', "Content-Type": "application/octet-stream"}
+
+    @route("POST", f"{API}/branch/(?P<branch>[^/]+)", write=True)
+    def create_branch(self, repo: Repo, branch: str) -> Any:
+        if branch in repo.branches:
+            raise HubError(409, f"Reference already exists: {branch}")
+        repo.branches[branch] = repo.at(json.loads(self.body).get("startingPoint", "main"))
+        return {}
+
+    @route("POST", f"{API}/tag/{REVISION}", write=True)
+    def create_tag(self, repo: Repo, revision: str) -> Any:
+        tag = json.loads(self.body)["tag"]
+        commit = repo.at(revision)
+        if repo.tags.setdefault(tag, commit) is not commit:
+            raise HubError(409, f"Tag reference exists already: {tag}")
+        return {}
+
+    @route("DELETE", f"{API}/tag/(?P<tag>[^/]+)", write=True)
+    def delete_tag(self, repo: Repo, tag: str) -> Any:
+        if repo.tags.pop(tag, None) is None:
+            raise HubError(404, f"Tag not found: {tag}", "RevisionNotFound")
+        return {}
+
+    @route("POST", f"{API}/preupload/{REVISION}", write=True)
+    def preupload(self, repo: Repo, revision: str) -> Any:
+        files, there = json.loads(self.body)["files"], repo.at(revision).files
+        for file in files:
+            path = file["path"]
+            file["uploadMode"] = "lfs" if path.endswith(LFS_SUFFIXES) or file["size"] > LFS_SIZE else "regular"
+            file["shouldIgnore"] = False
+            file["oid"] = there[path].etag if path in there else None
+        return {"files": files}
+
+    @route("POST", f"{WEB}.git/info/lfs/objects/batch", write=True)
+    def lfs_batch(self, repo: Repo) -> Any:
+        wanted = {item["oid"]: item for item in json.loads(self.body)["objects"]}
+        for oid in wanted.keys() - repo.objects.keys():  # the others lack actions: there is nothing to upload
+            key = secrets.token_hex()
+            self.server.signed[key] = repo, oid
+            wanted[oid]["actions"] = {"upload": {"href": f"{self.origin}/lfs/{key}"}}
+        return {"transfer": "basic", "objects": list(wanted.values())}
+
+    @route("PUT", r"/lfs/(?P<key>\w+)")
+    def lfs_upload(self, key: str) -> Any:
+        hub = self.server
+        if hub.fail_uploads_after is not None and len(hub.lfs_uploads) >= hub.fail_uploads_after:
+            raise ConnectionAbortedError
+        repo, oid = hub.signed.get(key, (None, None))
+        if repo is None or hashlib.sha256(self.body).hexdigest() != oid:
+            raise HubError(400, "The content does not match what was announced")
+        repo.objects[oid] = self.body
+        hub.lfs_uploads.append(oid)
+        return {}
+
+    @route("POST", f"{API}/commit/{REVISION}", write=True)
+    def commit(self, repo: Repo, revision: str) -> Any:
+        if revision not in repo.branches:
+            raise HubError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+        if "create_pr" in self.query:
+            raise HubError(501, "Pull requests are not part of this server")
+        parent = repo.branches[revision]
+        files, header = dict(parent.files), {}
+        for line in self.body.splitlines():
+            key, value = (item := json.loads(line))["key"], item["value"]
+            path = value.get("path", "")
+            if key == "header":
+                header = value
+            elif key == "file":
+                files[path] = Blob(base64.b64decode(value["content"]))
+            elif key == "lfsFile" and value["oid"] in repo.objects:
+                files[path] = Blob(repo.objects[value["oid"]], is_lfs=True)
+            elif key == "lfsFile":
+                raise HubError(400, f"{path} points to an LFS object that was not uploaded")
+            elif key != "deletedFile":
+                raise HubError(501, f"{key} is not part of this server")
+            elif files.pop(path, None) is None:
+                raise HubError(404, f"A file with this name doesn't exist: {path}", "EntryNotFound")
+        if header.get("parentCommit", parent.oid) != parent.oid:
+            raise HubError(412, "A commit has happened since. Please refresh and try again.")
+        commit = Commit(files, header["summary"], parent)
+        repo.add(revision, commit)
+        return {"success": True, "commitUrl": f"{self.address(repo)}/commit/{commit.oid}", "commitOid": commit.oid}
+
+
+@contextmanager
+def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iterator[None]:
+    """Let this process' client, and LeRobot, find `hub` where they look for the Hugging Face Hub, and nothing else.
+
+    Downloads go to a cache of their own, since the client takes from a cache what the Hub refuses; it is deleted at
+    the end unless `cache` names a folder for it. Retries do not wait. It may be nested, for another user's view.
+    """
+    import httpx
+    from huggingface_hub import constants, set_client_factory
+    from huggingface_hub.utils import _http
+
+    class Delivery(httpx.HTTPTransport):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            url = hub.url + request.url.raw_path.decode()
+            return super().handle_request(
+                httpx.Request(
+                    request.method, url, headers=request.headers, stream=request.stream, extensions=request.extensions
+                )
+            )
+
+    def client() -> httpx.Client:
+        hooks = {"request": [_http.hf_request_event_hook]}
+        return httpx.Client(transport=Delivery(), event_hooks=hooks, follow_redirects=True, timeout=None)
+
+    with ExitStack() as stack:
+        folder = cache or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="symview-hub-")))
+        stack.enter_context(mock.patch.dict(os.environ, {"HF_TOKEN": token or "", "HUGGING_FACE_HUB_TOKEN": ""}))
+        changed = {"HF_HUB_OFFLINE": False, "HF_HUB_DISABLE_XET": True, "HF_HUB_DISABLE_TELEMETRY": True}
+        changed |= {"HF_HUB_CACHE": str(folder / "hub"), "HF_TOKEN_PATH": str(folder / "token")}
+        stack.enter_context(mock.patch.multiple(constants, **changed))
+        for module in ("dataset_metadata", "lerobot_dataset"):  # which have copies of it
+            stack.enter_context(mock.patch(f"lerobot.datasets.{module}.HF_LEROBOT_HUB_CACHE", folder / "lerobot"))
+        stack.enter_context(mock.patch.object(_http, "time", SimpleNamespace(sleep=lambda seconds: None)))
+        stack.callback(set_client_factory, _http._GLOBAL_CLIENT_FACTORY)  # also closes the connections
+        set_client_factory(client)
+        yield

@@ -1,0 +1,143 @@
+"""Datasets and policies go to the Hub and come back, over HTTP; and what users are told when that fails."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+import torch
+from huggingface_hub import DatasetCard, ModelCard
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.scripts import lerobot_eval
+
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.cli import CommandError
+from lerobot_symview.hub import PushedDataset, push_dataset
+from symview_sim.generate import GenerateConfig, generate
+from symview_sim.settings import NewDataset
+from tests.hub_server import ALICE, BOB, HubServer, online
+from tests.lerobot_policy_symview.test_training import train
+
+
+@pytest.fixture
+def hub():
+    with HubServer() as server, online(server, ALICE):
+        yield server
+
+
+@pytest.fixture
+def target(recorded, tmp_path):
+    """A dataset on disk that alice may push."""
+    folder = shutil.copytree(recorded, tmp_path / "recorded")
+    return PushedDataset("alice/picking", folder)
+
+
+def local_files(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_generated_dataset_is_pulled_by_its_name(hub, tmp_path):
+    dataset = NewDataset("alice/new", tmp_path / "new", push_to_hub=True, tags=["mine"])
+    folder = generate(GenerateConfig(dataset, num_episodes=1))
+    assert {name: hub.files("alice/new")[name] for name in local_files(folder)} == local_files(folder)
+    pulled, here = LeRobotDataset("alice/new"), LeRobotDataset("alice/new", root=folder)
+    assert pulled.root != folder
+    assert torch.equal(pulled[3]["action"], here[3]["action"])
+    assert torch.equal(pulled[3]["observation.images.side"], here[3]["observation.images.side"])
+    card = DatasetCard(hub.files("alice/new")["README.md"].decode())
+    assert {"LeRobot", "symview", "mine"} <= set(card.data.tags)
+    for fact in ("block_picking", "panda", "`observation.images.side`", "45 degrees", "100.0 %", "K in pixels"):
+        assert fact in card.text
+    assert hub.files("alice/new")["meta/symview_picture.png"].startswith(b"\x89PNG")
+
+
+def test_views_are_pushed_to_a_private_branch_with_their_parameters(hub, target, tmp_path):
+    pushed = replace(target, push_to_hub=True, private=True, branch="small")
+    add_views(AddViewsConfig(pushed, new_repo_id="alice/seen", new_root=tmp_path / "seen", size=76, keep=[]))
+    assert hub.repos["dataset", "alice/seen"].private
+    assert ("dataset", "alice/picking") not in hub.repos
+    text = hub.files("alice/seen", revision="small")["README.md"].decode()
+    assert "view `reproj` made from camera `side` (size=76, infill=nearest" in text
+    assert "--policy.method=reproj_equi" in text
+    assert LeRobotDataset("alice/seen", revision="small").meta.total_episodes == 2
+    with online(hub, BOB), pytest.raises(Exception, match=r"404|not found|Not Found"):
+        LeRobotDataset("alice/seen", revision="small")
+
+
+def test_an_upload_that_breaks_off_is_gone_on_with(hub, target):
+    before = local_files(target.folder())
+    hub.fail_uploads_after = 1
+    with pytest.raises(CommandError, match=r"broke off.*Nothing is lost.*--resume=true"):
+        push_dataset(target, target)
+    assert before.items() <= local_files(target.folder()).items()
+    hub.fail_uploads_after = None
+    push_dataset(target, target)
+    assert len(hub.lfs_uploads) == len(set(hub.lfs_uploads)) > 1
+    assert local_files(target.folder()).items() <= hub.files("alice/picking").items()
+
+
+@pytest.mark.parametrize(
+    ("token", "message"),
+    [
+        ("hf_unknown", "the Hub does not know the token: run `hf auth login` again"),
+        (BOB, "must not write to alice/picking: name a --dataset.repo_id of yours"),
+        (None, "`hf auth login`"),
+    ],
+)
+def test_who_may_not_push_is_told_what_to_do(token, message, hub, target):
+    with online(hub, token), pytest.raises(CommandError, match=message) as told:
+        push_dataset(target, target)
+    assert "Nothing is lost" in str(told.value)
+
+
+def test_without_a_network_it_says_so(target, monkeypatch):
+    with pytest.raises(CommandError, match="HF_HUB_OFFLINE=1 keeps alice/picking from the Hub: unset it"):
+        push_dataset(target, target)
+    with HubServer() as gone, online(gone, ALICE):
+        gone.__exit__(None, None, None)
+        with pytest.raises(CommandError, match="the Hub cannot be reached"):
+            push_dataset(target, target)
+
+
+def test_a_policy_is_pushed_by_lerobot_and_evaluated_by_its_name(hub, with_views, tmp_path, monkeypatch):
+    options = ("--policy.push_to_hub=true", "--policy.repo_id=alice/picker", "--policy.tags=[mine]")
+    local = train(monkeypatch, with_views, tmp_path / "policy", *options)
+    card = ModelCard(hub.files("alice/picker", kind="model")["README.md"].decode())
+    assert card.data.datasets == ["test/recorded"]
+    assert {"symview", "symview_bc", "mine"} <= set(card.data.tags)
+    for fact in ("method `reproj_equi`", "group D4", "x, y, z, yaw, aperture", "steps 2", "episodes 2", "## Limits"):
+        assert fact in card.text
+    pulled, here = SymviewBcPolicy.from_pretrained("alice/picker"), SymviewBcPolicy.from_pretrained(local)
+    assert all(one.equal(other) for one, other in zip(pulled.parameters(), here.parameters(), strict=True))
+    steps = make_pre_post_processors(pulled.config, "alice/picker")[0].steps
+    assert [type(step).__name__ for step in steps].count("ViewsProcessorStep") == 1
+    arguments = ["lerobot-eval", "--policy.path=alice/picker", "--policy.device=cpu", "--env.type=symview"]
+    arguments += [
+        "--env.max_steps=2",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    ]
+    monkeypatch.setattr(sys, "argv", arguments)
+    lerobot_eval.main()
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
+    """In a process of its own, as a user has it: the dataset by its name, the plugin found because it is installed."""
+    with HubServer() as hub:
+        with online(hub, ALICE):
+            push_dataset(target, target)
+        program = shutil.which("lerobot-train", path=os.path.dirname(sys.executable))
+        command = [program, "--dataset.repo_id=alice/picking", "--policy.type=symview_bc", "--policy.width=16"]
+        command += ["--policy.crop_size=64", "--policy.device=cpu", "--policy.push_to_hub=false", "--steps=1"]
+        command += ["--batch_size=2", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={tmp_path / 'out'}"]
+        home = {"HF_HOME": str(tmp_path / "home"), "HF_LEROBOT_HOME": str(tmp_path / "home" / "lerobot")}
+        done = subprocess.run(command, env=os.environ | hub.environment(ALICE) | home, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr[-2000:]
+    assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
