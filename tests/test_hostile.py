@@ -134,9 +134,7 @@ def make_video_feature(dataset, video_path="videos/{video_key}/chunk-{chunk_inde
 def png_of(height, width):
     """The beginning of a PNG file that says it has so many pixels, and holds none."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + b"\0\0\0\0IDAT"
-    )
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
 
 
 def tiff_of(height, width):
@@ -275,13 +273,13 @@ def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, p
 
 @unsafe
 @both_commands
-@pytest.mark.parametrize("name", ["../../../private", "PRIVATE", "..", ".", "", "a/b", "a\0b"])
+@pytest.mark.parametrize("name", ["../../../strangers/private", "../../private", "PRIVATE", "..", "", "a/b", "a\0b"])
 def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, name):
     """The videos of a feature are copied from the folder of its name to the folder of its name."""
     (dataset / "videos").mkdir()
     video = {"dtype": "video", "shape": [8, 8, 3], "names": ["height", "width", "channels"], "info": {}}
     change_feature(dataset, name.replace("PRIVATE", str(outside)), **video)
-    with pytest.raises(CommandError, match="feature"):
+    with pytest.raises(CommandError, match=r"info\.json: the feature"):
         command(dataset, tmp_path)
     assert list(tmp_path.rglob("secret.txt")) == [outside / "secret.txt"]
 
@@ -315,7 +313,7 @@ def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
         (RGB, png_of(30_000, 20_000), "30000 x 20000"),
         (RGB, encoded(".png", np.zeros((300, 290, 3), np.uint8)), "300 x 290"),
         (RGB, encoded(".jpg", np.zeros((300, 290, 3), np.uint8)), "300 x 290"),
-        (DEPTH, tiff_of(30_000, 20_000), "30000 x 20000"),
+        (DEPTH, tiff_of(9_000, 8_000), "9000 x 8000"),
         (DEPTH, encoded(".tiff", np.ones((300, 290), np.float32)), "300 x 290"),
     ],
 )
@@ -342,7 +340,7 @@ def test_videos_are_no_larger_than_declared(dataset, tmp_path):
         for _ in range(16):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((304, 320, 3), np.uint8))))
         container.mux(stream.encode())
-    with pytest.raises(ValueError, match="304 x 320.*152 x 152"):
+    with pytest.raises(ValueError, match=r"304 x 320.*152 x 152"):
         look(dataset, tmp_path)
 
 
@@ -361,7 +359,7 @@ def test_there_are_no_more_episodes_than_declared(dataset):
     """Rows that are alike take next to nothing in a file."""
     table = pq.read_table(dataset / EPISODES)
     pq.write_table(table.take(pa.array(np.zeros(20_000, int))), dataset / EPISODES, compression="zstd")
-    with pytest.raises(CommandError, match="20000.*total_episodes"):
+    with pytest.raises(CommandError, match=r"20000.*total_episodes"):
         len(SourceDataset(dataset).episodes)
 
 
@@ -465,17 +463,17 @@ def test_a_narrow_image_is_not_enlarged_without_limit(workspace):
 
 @unsafe
 @pytest.mark.parametrize(
-    "text",
+    ("text", "message"),
     [
-        "a: &a [0, 0, 0, 0, 0, 0, 0, 0]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a]\nunits: m\ncameras: {front: *b}",
-        "[" * 3000,
-        "units: [m]\ncameras: {front: 1}",
+        ("a: &a [0, 0, 0]\nb: &b [*a, *a, *a]\nunits: m\ncameras: {front: *b}", "has an alias"),
+        ("[" * 3000, "cannot read"),
+        ("units: [m]\ncameras: {front: 1}", "units must be"),
     ],
 )
-def test_a_calibration_that_grows_when_it_is_read_is_refused(tmp_path, text):
-    """Each line of aliases multiplies what a message about it would quote."""
+def test_a_calibration_that_grows_or_ends_in_a_traceback_is_refused(tmp_path, text, message):
+    """Every line of aliases multiplies what arrays and messages are made of."""
     (tmp_path / "cameras.yaml").write_text(text)
-    with pytest.raises(CommandError, match="--calibration="):
+    with pytest.raises((CommandError, CalibrationError), match=message):
         read_calibration(tmp_path / "cameras.yaml")
 
 

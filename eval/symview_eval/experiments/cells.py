@@ -117,6 +117,7 @@ def _run(job: Job, start: float) -> None:
             part.save_pretrained(kept / "pretrained_model")
     origin = Origin(
         configuration=cell.configuration_hash,
+        seed=cell.seed,
         version=version("lerobot_policy_symview"),
         machine=_machine(job.device),
         seconds=time.perf_counter() - start,

@@ -51,6 +51,8 @@ class Origin:
 
     configuration: str
     """Hash of everything that determines it."""
+    seed: int
+    """Of scenes, demonstrations and training."""
     version: str
     """Of this package."""
     machine: str

@@ -13,7 +13,7 @@ from symview_sim.settings import NewDataset, RecordedDataset
 
 
 def learning_curve(data, folder, method):
-    """Success after every 200 steps, from a camera at 45 degrees."""
+    """Success after every 150 steps, from a camera at 45 degrees."""
     policy = SymviewSacfdConfig(
         device="cpu", method=method, width=16, crop_size=64, expert_weight=10, weight_averaging=0.99
     )
@@ -21,9 +21,9 @@ def learning_curve(data, folder, method):
         dataset=RecordedDataset("test/picking", data),
         policy=policy,
         output_dir=folder,
-        steps=800,
+        steps=600,
         batch_size=32,
-        eval_every=200,
+        eval_every=150,
         eval_episodes=40,
     )
     train_rl(config)

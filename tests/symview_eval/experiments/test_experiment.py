@@ -119,6 +119,14 @@ def test_a_cell_that_fails_does_not_keep_others_from_running(tmp_path, monkeypat
         assert list(csv.DictReader(line for line in stream if not line.startswith("#")))
 
 
+def test_cells_run_on_a_ray_cluster(table1, tmp_path):
+    chosen = {"tasks": ["block_picking"], "methods": ["reproj_equi", "sideview_nonequi"]}
+    run_experiment("table1", config(tmp_path, executor="ray", num_workers=2, **chosen))
+    for path in (tmp_path / "results").rglob("*.csv"):
+        assert read_result(path).checkpoints == read_result(table1 / path.relative_to(tmp_path)).checkpoints
+    assert len(list((tmp_path / "results").rglob("*.csv"))) == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
