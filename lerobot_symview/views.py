@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.camera import Camera, depth_in_metres
-from lerobot_symview.names import lookup
+from lerobot_symview.names import added, lookup
 from lerobot_symview.perspective import warp_map, warp_plane
 from lerobot_symview.workspace import Workspace
 
@@ -90,8 +90,17 @@ def register_view(name: str) -> Callable[[type], type]:
 
 
 def make_view(name: str, **options: Any) -> View:
-    """Return the view `name`; an unknown name is answered with the nearest known one."""
-    return lookup("view", name, VIEWS)(**options)
+    """Return the view `name`, a registered one or an entry point of the group `symview.views`.
+
+    Raises:
+        ValueError: if there is none; it names the nearest.
+    """
+    if name in VIEWS:
+        return VIEWS[name](**options)
+    others = added("symview.views")
+    lookup("view", name, dict.fromkeys((*VIEWS, *others)))
+    view: View = others[name].load()(**options)
+    return view
 
 
 def choose_views(names: list[str], size: int | None, options: dict[str, View]) -> dict[str, View]:

@@ -10,7 +10,7 @@ from lerobot_symview.hub import HubOptions
 from lerobot_symview.names import lookup
 from lerobot_symview.placement import CameraSpec
 from symview_sim.robots import ROBOTS
-from symview_sim.tasks import TASK_NAMES
+from symview_sim.tasks import check_task
 
 if TYPE_CHECKING:
     from symview_sim.env import SymviewEnv
@@ -40,7 +40,7 @@ class EnvSettings:
     """Actions per episode."""
 
     def __post_init__(self) -> None:
-        lookup("task", self.task, dict.fromkeys(TASK_NAMES))
+        check_task(self.task)
         lookup("robot", self.robot, ROBOTS)
         if self.start_jitter < 0:
             raise ValueError(f"--env.start_jitter must not be negative, got {self.start_jitter}")

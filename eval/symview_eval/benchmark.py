@@ -23,7 +23,7 @@ from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
 from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
-from symview_sim.tasks import TASK_NAMES
+from symview_sim.tasks import TASK_NAMES, check_task
 
 REPEATS = 50
 TIMED = {
@@ -56,7 +56,7 @@ class ExpertsBenchmark:
         if self.seeds < 1:
             raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
         for task in self.tasks:
-            lookup("task", task, dict.fromkeys(TASK_NAMES))
+            check_task(task)
 
 
 @dataclass(frozen=True)

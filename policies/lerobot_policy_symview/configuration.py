@@ -13,7 +13,7 @@ from lerobot_policy_symview.groups import GROUP_NAMES, make_group
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.symmetry import Symmetry, ThetaRepresentation
 from lerobot_symview import keys
-from lerobot_symview.names import lookup
+from lerobot_symview.names import added, lookup
 from lerobot_symview.views import VIEWS, View, make_view
 from lerobot_symview.workspace import Workspace
 
@@ -32,6 +32,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "augmentation": ("none", "d4", "so2", "o2"),
     "dtype": ("float32", "bfloat16"),
 }
+EXTENSIBLE = {"view": "symview.views", "encoder": "symview.encoders"}  # by entry points of these groups
 
 
 def as_method_says() -> Any:
@@ -121,7 +122,10 @@ class SymviewConfig(PreTrainedConfig):
         _ = self.actions, self.states  # declarations are checked when they are parsed
 
     def _check_choice(self, name: str, choices: tuple[Any, ...]) -> None:
-        lookup(f"--policy.{name}", str(getattr(self, name)), dict.fromkeys(map(str, choices)))
+        value, names = str(getattr(self, name)), tuple(map(str, choices))
+        if value not in names:
+            names += tuple(added(EXTENSIBLE[name])) if name in EXTENSIBLE else ()
+            lookup(f"--policy.{name}", value, dict.fromkeys(names))
 
     def _check_combination(self) -> None:
         if (self.encoder == "plain") != (self.group == "C1"):

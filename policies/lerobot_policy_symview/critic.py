@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.encoders import ENCODERS
+from lerobot_policy_symview.encoders import make_encoder
 from lerobot_policy_symview.groups import PlanarGroup, make_group
 from lerobot_policy_symview.layers import FieldLinear
 from lerobot_policy_symview.state_input import StateInput
@@ -59,6 +59,6 @@ class Critic(nn.Module):
     def __init__(self, config: SymviewConfig, inputs: StateInput):
         super().__init__()
         group = make_group(config.group)
-        self.encoder = ENCODERS[config.encoder](config, group, inputs.representation(group))
+        self.encoder = make_encoder(config, group, inputs.representation(group))
         actions = config.actions.representation(group, config.theta_representation)
         self.values = DoubleQ(group, self.encoder.fields, actions)

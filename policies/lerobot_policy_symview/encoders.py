@@ -20,6 +20,7 @@ from lerobot_policy_symview.groups import PlanarGroup, block_diagonal
 from lerobot_policy_symview.layers import FieldConv2d, FieldConv3d, RelaxedConv2d
 from lerobot_policy_symview.point_encoder import PointEncoder
 from lerobot_policy_symview.voxels import VOXEL_CHANNELS
+from lerobot_symview.names import added
 
 CHANNELS_LAST = {2: torch.channels_last, 3: torch.channels_last_3d}
 Convolution = Callable[[PlanarGroup, int | NDArray[np.float64], int, int], nn.Module]
@@ -142,3 +143,17 @@ ENCODERS: dict[str, Callable[[SymviewConfig, PlanarGroup, NDArray[np.float64]], 
     "voxel": lambda config, group, state: VoxelEncoder(group, state, config.width),
     "point_cloud": lambda config, group, state: PointEncoder(group, state, config.width),
 }
+
+
+def make_encoder(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder that a configuration names, one of ours or an entry point of the group `symview.encoders`.
+
+    Args:
+        config: the policy's.
+        group: of G elements.
+        state: how the numbers beside the picture move, (G, D, D).
+    """
+    if config.encoder in ENCODERS:
+        return ENCODERS[config.encoder](config, group, state)
+    encoder: Encoder = added("symview.encoders")[config.encoder].load()(config, group, state)
+    return encoder

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from lerobot_policy_symview.augmentation import crop, move_images, random_motion, scale_down
 from lerobot_policy_symview.clouds import cloud_from_depth
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
-from lerobot_policy_symview.encoders import ENCODERS
+from lerobot_policy_symview.encoders import make_encoder
 from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.point_encoder import POINTS
@@ -47,7 +47,7 @@ class Network(nn.Module):
     def __init__(self, config: SymviewConfig, inputs: StateInput, make_head: MakeHead):
         super().__init__()
         group = make_group(config.group)
-        self.encoder = ENCODERS[config.encoder](config, group, inputs.representation(group))
+        self.encoder = make_encoder(config, group, inputs.representation(group))
         self.head: Any = make_head(
             self.encoder.fields, config.actions.representation(group, config.theta_representation)
         )

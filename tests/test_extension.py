@@ -1,0 +1,101 @@
+"""A task, a view and an encoder of another package, which are there because it is installed."""
+
+import json
+import sys
+from textwrap import dedent
+
+import pytest
+from lerobot.scripts import lerobot_eval
+
+from lerobot_symview import names
+from lerobot_symview.add_views import AddViewsConfig, add_views
+from lerobot_symview.hub import PushedDataset
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+from tests.lerobot_policy_symview.test_training import train
+
+MODULE = """
+    from dataclasses import dataclass
+
+    import cv2
+    import torch
+
+    from lerobot_policy_symview.encoder import Encoder
+    from symview_sim.tasks.block_picking import BlockPicking
+
+
+    class EasyPicking(BlockPicking):
+        instruction = "Pick up the red block, which lies in the middle."
+
+        def spawn(self, scene, rng):
+            place = (*scene.workspace.center, 0.025)
+            self._cube = scene.add_box((0.05, 0.05, 0.05), 0.1, 1.0, (0.9, 0.1, 0.1), place, rng.uniform(-0.7, 0.7))
+
+
+    @dataclass(frozen=True)
+    class GreyView:
+        size: int = 76
+        outputs = {"grey": "rgb"}
+        needs_depth = needs_gripper = False
+
+        def render(self, frame):
+            grey = cv2.cvtColor(cv2.resize(frame.rgb, (self.size, self.size)), cv2.COLOR_RGB2GRAY)
+            return {"grey": cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)}
+
+
+    class MeanEncoder(Encoder):
+        def __init__(self, config, group, state):
+            super().__init__(group, config.width)
+            self.linear = torch.nn.Linear(config.channels + len(state[0]), config.width)
+
+        def forward(self, picture, state):
+            features = self.linear(torch.cat([picture.mean(dim=(2, 3)), state], dim=1))
+            return features[:, None].expand(-1, self.group.size, -1)
+"""
+ENTRY_POINTS = """
+    [symview.tasks]
+    easy_picking = other_package:EasyPicking
+    [symview.views]
+    grey = other_package:GreyView
+    [symview.encoders]
+    mean = other_package:MeanEncoder
+"""
+
+
+@pytest.fixture
+def other_package(tmp_path, monkeypatch):
+    """Install a package the way pip does, for as long as the test runs."""
+    site = tmp_path / "site"
+    facts = site / "other_package-1.0.dist-info"
+    facts.mkdir(parents=True)
+    (site / "other_package.py").write_text(dedent(MODULE))
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: other-package\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text(dedent(ENTRY_POINTS))
+    monkeypatch.syspath_prepend(str(site))
+    names.added.cache_clear()
+    yield
+    names.added.cache_clear()
+    sys.modules.pop("other_package", None)
+
+
+@pytest.mark.usefixtures("other_package")
+def test_another_packages_task_view_and_encoder_go_all_the_way(tmp_path, monkeypatch):
+    recorded, seen = tmp_path / "recorded", tmp_path / "seen"
+    env = RecordedEnv(task="easy_picking", oracle=False)
+    generate(GenerateConfig(NewDataset("test/recorded", recorded), env=env, num_episodes=2, num_workers=2))
+    source = PushedDataset("test/recorded", recorded)
+    add_views(AddViewsConfig(source, new_repo_id="test/seen", new_root=seen, views=["grey"], num_workers=2))
+    options = ("--policy.view=grey", "--policy.modality=rgb", "--policy.gripper_input=none", "--policy.encoder=mean")
+    checkpoint = train(monkeypatch, seen, tmp_path / "policy", *options)
+    arguments = ["lerobot-eval", f"--policy.path={checkpoint}", "--policy.device=cpu", "--env.type=symview"]
+    arguments += ["--env.task=easy_picking", "--env.max_steps=2", "--eval.n_episodes=2", "--eval.batch_size=2"]
+    arguments += [f"--output_dir={tmp_path / 'eval'}"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    lerobot_eval.main()
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 2
+
+
+@pytest.mark.usefixtures("other_package")
+def test_their_names_are_suggested_too():
+    with pytest.raises(ValueError, match="did you mean 'easy_picking'"):
+        RecordedEnv(task="easy_piking")
