@@ -63,8 +63,11 @@ def read_calibration(file: Path) -> Calibration:
     import yaml
 
     try:
-        content = yaml.safe_load(file.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        text = file.read_text()
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise CommandError(f"--calibration={file} has an alias (*name): write out what it stands for")
+        content = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise CommandError(f"cannot read --calibration={file}: {error}") from None
     try:
         return parse_calibration(content)
@@ -81,13 +84,14 @@ def parse_calibration(content: Any) -> Calibration:
     if not isinstance(content, Mapping):
         raise CalibrationError(f"expected a mapping with units and cameras, got {type(content).__name__}")
     problems = _strangers("the file", content, ("units", "workspace", "cameras"))
-    if content.get("units") not in METRES:
-        problems.append(f"units must be m or mm, got {content.get('units')!r}")
+    units = content.get("units")
+    if not isinstance(units, str) or units not in METRES:
+        problems.append(f"units must be m or mm, got {units!r}")
     named = content.get("cameras")
     if not isinstance(named, Mapping) or not named:
         problems.append("cameras must name at least one camera")
         named = {}
-    metres = METRES.get(content.get("units", ""), 1.0)
+    metres = METRES.get(str(units), 1.0)
     cameras, workspace = {}, None
     for name, entries in named.items():
         try:

@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from lerobot_symview import keys
+from lerobot_symview.camera import CalibrationError
 from lerobot_symview.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -73,8 +74,13 @@ def view_features(
 
 def stored_workspace(features: Features) -> Workspace:
     """Return the workspace a dataset was recorded in; the default one where it does not say."""
-    for feature in features.values():
+    from lerobot_symview.calibration import parse_workspace
+
+    for key, feature in features.items():
         facts = (feature.get("info") or {}).get("symview", {})
         if "workspace" in facts:
-            return Workspace(**(facts["workspace"] | {"center": tuple(facts["workspace"]["center"])}))
+            try:
+                return parse_workspace(facts["workspace"])
+            except CalibrationError as error:
+                raise CalibrationError(f"the workspace that {key} states: {error}") from None
     return Workspace()

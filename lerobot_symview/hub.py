@@ -45,7 +45,7 @@ def push_dataset(target: DatasetTarget, options: HubOptions) -> str:
         CARD,
         write_card,
     )
-    from lerobot_symview.source_dataset import FORMAT
+    from lerobot_symview.metadata import FORMAT
 
     folder, repo_id = target.folder(), target.repo_id
     write_card(folder, repo_id, options.tags)

@@ -2,14 +2,54 @@
 
 from __future__ import annotations
 
+import io
+import struct
 from collections.abc import Buffer
+from contextlib import suppress
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 PNG_LEVEL = 1  # LeRobot's own: level 6 takes seven times as long for a tenth less
+PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # its first bytes; width and height follow
+TIFF, TIFF_WIDTH, TIFF_HEIGHT = {b"II*\0": "<", b"MM\0*": ">"}, 256, 257  # byte orders; tags
+TIFF_TYPES = {3: "H", 4: "I"}
 NO_COMPRESSION = 1  # TIFF's code for none
+
+
+def encoded_size(data: Buffer) -> tuple[int, int]:
+    """Return height and width that an encoded image states, without decoding it.
+
+    Raises:
+        ValueError: if `data` is no image.
+    """
+    head = bytes(memoryview(data)[:24])
+    if head.startswith(PNG) and len(head) == 24:  # nearly all images are PNG or TIFF; PIL takes longer than decoding
+        width, height = struct.unpack(">II", head[16:])
+        return height, width
+    if head[:4] in TIFF:
+        with suppress(struct.error, KeyError):
+            return _tiff_size(memoryview(data), TIFF[head[:4]])
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            return image.height, image.width
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ValueError(f"{len(memoryview(data))} bytes that are no image: {error}") from None
+
+
+def _tiff_size(data: memoryview, order: str) -> tuple[int, int]:
+    """Return height and width from the first directory, whose entries have 12 bytes: tag, type, count, value."""
+    (start,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, start)
+    values = {}
+    for offset in range(start + 2, start + 2 + 12 * count, 12):
+        tag, kind, _ = struct.unpack_from(f"{order}HHI", data, offset)
+        if tag in (TIFF_WIDTH, TIFF_HEIGHT):
+            (values[tag],) = struct.unpack_from(f"{order}{TIFF_TYPES[kind]}", data, offset + 8)
+    return values[TIFF_HEIGHT], values[TIFF_WIDTH]
 
 
 def decode_rgb(data: Buffer) -> NDArray[np.uint8]:

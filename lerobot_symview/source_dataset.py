@@ -5,7 +5,6 @@ Tables are read as they are: LeRobot itself, which takes seconds to import, is n
 
 from __future__ import annotations
 
-import json
 from collections.abc import Buffer, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,11 +22,12 @@ from lerobot_symview.calibration import Calibration
 from lerobot_symview.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
 from lerobot_symview.cli import CommandError
 from lerobot_symview.features import Features
-from lerobot_symview.image_codec import decode_depth, decode_rgb
+from lerobot_symview.image_codec import decode_depth, decode_rgb, encoded_size
+from lerobot_symview.metadata import is_count, pixels, read_info
 from lerobot_symview.views import Frame, View
 from lerobot_symview.workspace import Workspace
 
-FORMAT = "v3.0"  # LeRobot's
+ROW_BYTES = 2**20  # of a table at most, beside its images
 VIDEO_FRAMES = 64  # decoded at a time
 VIDEO_TOLERANCE = 1e-4  # seconds, LeRobot's own
 
@@ -44,15 +44,7 @@ class SourceDataset:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        file = folder / "meta" / "info.json"
-        if not file.is_file():
-            raise CommandError(f"no dataset at {folder}: check --dataset.repo_id and --dataset.root")
-        self.info: dict[str, Any] = json.loads(file.read_text())
-        version = self.info.get("codebase_version")
-        if version != FORMAT:
-            raise CommandError(
-                f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot"
-            )
+        self.info = read_info(folder)
 
     @property
     def features(self) -> Features:
@@ -62,11 +54,41 @@ class SourceDataset:
     @cached_property
     def episodes(self) -> list[dict[str, Any]]:
         """What `meta/episodes` says of every episode, in order, without its statistics."""
+        files = sorted((self.folder / "meta" / "episodes").rglob("*.parquet"))
+        count = sum(pq.read_metadata(file).num_rows for file in files)
+        if count != self.info["total_episodes"]:
+            raise CommandError(
+                f"{self.folder / 'meta' / 'episodes'} has {count} rows, total_episodes is {self.info['total_episodes']}"
+            )
         rows = []
-        for file in sorted((self.folder / "meta" / "episodes").rglob("*.parquet")):
+        for file in files:
             names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
             rows += pq.read_table(file, columns=names).to_pylist()
-        return sorted(rows, key=lambda row: row["episode_index"])
+        rows.sort(key=lambda row: row["episode_index"] if is_count(row.get("episode_index"), 0) else -1)
+        self._check_episodes(rows)
+        return rows
+
+    def _check_episodes(self, rows: list[dict[str, Any]]) -> None:
+        """Raise a CommandError unless each row follows the one before, in whole numbers, within all frames."""
+        frames, end = self.info["total_frames"], 0
+        for index, row in enumerate(rows):
+            bounds = {
+                "episode_index": (index, index),
+                "length": (1, frames),
+                "dataset_from_index": (end, frames - 1),
+                "data/chunk_index": (0, None),
+                "data/file_index": (0, None),
+            }
+            bounds |= {name: (0, None) for name in row if name.startswith("videos/") and name.endswith("_index")}
+            for name, (least, most) in bounds.items():
+                value = row.get(name)
+                if not is_count(value, least) or (most is not None and value > most):
+                    upper = "" if most is None else f" to {most}"
+                    raise CommandError(
+                        f"{self.folder / 'meta' / 'episodes'}: episode {index} has {name} {value!r}, "
+                        f"expected a whole number from {least}{upper}"
+                    )
+            end = row["dataset_from_index"] + row["length"]
 
     def data_file(self, episode: int) -> Path:
         """Where an episode's table is."""
@@ -101,18 +123,29 @@ class SourceDataset:
             yield from self._video_frames(key, episode, table["timestamp"].to_numpy())
             return
         for cell in table[key]:
-            yield self.decode(key, cell["bytes"].as_buffer())
+            data = cell["bytes"].as_buffer()
+            if data is None:
+                raise ValueError(f"{key}: expected an image in the table, got none, and the path {cell['path']}")
+            yield self.decode(key, data)
 
     def decode(self, key: str, data: Buffer) -> NDArray:
         """Decode one image of an image feature, as `images` yields it."""
         feature = self.features[key]
+        self._check_size(key, *encoded_size(data))
         if not is_depth_feature(feature):
             return decode_rgb(data)
         depth = decode_depth(data)
         in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
         return depth / np.float32(MILLIMETRES_PER_METRE) if in_millimetres and depth.dtype.kind == "f" else depth
 
+    def _check_size(self, key: str, height: int, width: int) -> None:
+        shape = self.features[key]["shape"]
+        if height * width > pixels(shape):
+            declared = " x ".join(map(str, shape))
+            raise ValueError(f"{key}: an image of {height} x {width} pixels, the dataset declares {declared}")
+
     def _video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
+        import av
         from lerobot.configs.video import DepthEncoderConfig
         from lerobot.datasets.depth_utils import dequantize_depth
         from lerobot.datasets.video_utils import decode_video_frames
@@ -120,6 +153,9 @@ class SourceDataset:
         row, info = self.episodes[episode], self.features[key].get("info") or {}
         place = {part: row[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
         file = self.folder / self.info["video_path"].format(video_key=key, **place)
+        with av.open(str(file)) as container:
+            stream = container.streams.video[0]
+            self._check_size(key, stream.height, stream.width)
         is_depth = is_depth_feature(self.features[key])
         for first in range(0, len(timestamps), VIDEO_FRAMES):
             moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
@@ -147,13 +183,24 @@ class EpisodeTables:
         self._dataset = dataset
         self._columns = columns
         self._file = pq.ParquetFile(file)
-        counts = [self._file.metadata.row_group(group).num_rows for group in range(self._file.num_row_groups)]
+        groups = [self._file.metadata.row_group(group) for group in range(self._file.num_row_groups)]
+        images = [feature["shape"] for feature in dataset.features.values() if feature["dtype"] == "image"]
+        row_bytes = ROW_BYTES + sum(8 * pixels(shape) for shape in images)
+        largest = max((group.total_byte_size / max(group.num_rows, 1) for group in groups), default=0)
+        if largest > row_bytes:
+            raise CommandError(f"{file} has rows of {largest:.0f} bytes, more than the {row_bytes} its images need")
+        counts = [group.num_rows for group in groups]
         self._starts = np.cumsum([0, *counts])
 
     def read(self, episode: int) -> pa.Table:
         """Return an episode's rows."""
         first = self._dataset.first_row(episode)
         count = self._dataset.episodes[episode]["length"]
+        if not 0 <= first <= self._starts[-1] - count:
+            raise CommandError(
+                f"episode {episode} has rows {first} to {first + count} by length and dataset_from_index, "
+                f"its table has {self._starts[-1]}"
+            )
         begin = int(np.searchsorted(self._starts, first, side="right")) - 1
         end = int(np.searchsorted(self._starts, first + count, side="left"))
         table = self._file.read_row_groups(list(range(begin, end)), columns=self._columns, use_threads=False)

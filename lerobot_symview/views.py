@@ -20,6 +20,7 @@ from lerobot_symview.names import added, lookup
 from lerobot_symview.perspective import warp_map, warp_plane
 from lerobot_symview.workspace import Workspace
 
+SMALLEST, LARGEST = 8, 4096  # rows and columns of a view
 INFILLS = ("nearest", "local", "none")
 
 
@@ -274,5 +275,5 @@ def _height(frame: Frame) -> float | None:
 
 
 def _check_size(size: int) -> None:
-    if size < 8:
-        raise ValueError(f"a view's size must be at least 8 pixels, got {size}")
+    if not SMALLEST <= size <= LARGEST:
+        raise ValueError(f"a view's size must lie in {SMALLEST} to {LARGEST} pixels, got {size}")

@@ -26,6 +26,8 @@ class Workspace:
     height_limit: float = 0.25
 
     def __post_init__(self) -> None:
+        if not np.isfinite([*self.center, self.size, self.height_limit]).all():
+            raise ValueError(f"a workspace must be finite, got {self}")
         if self.size <= 0 or self.height_limit <= 0:
             raise ValueError(
                 f"workspace size and height_limit must be positive metres, got {self.size:g} and {self.height_limit:g}"

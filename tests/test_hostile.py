@@ -46,7 +46,6 @@ from tests.lerobot_symview.derived import views_config
 ROOT = Path(__file__).parents[1]
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 RGB, DEPTH = keys.rgb("side"), keys.depth("side")
-unsafe = pytest.mark.xfail(strict=True, reason="not refused yet")
 
 
 def derive(dataset, folder):
@@ -229,7 +228,6 @@ TEMPLATES = [
 ]
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template):
@@ -239,7 +237,6 @@ def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template
         command(dataset, tmp_path)
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("template", [*TEMPLATES[:-3], "videos/{video_key.__class__}/{video_key}.mp4"])
 def test_videos_are_in_the_dataset(dataset, outside, tmp_path, command, template):
@@ -248,7 +245,6 @@ def test_videos_are_in_the_dataset(dataset, outside, tmp_path, command, template
         command(dataset, tmp_path)
 
 
-@unsafe
 def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, tmp_path):
     """With these numbers it is 77/77 in the source, and in the result, whose files are numbered from 0, ../.. ."""
     folder = "{file_index!s:.>2.{chunk_index}s}"
@@ -261,7 +257,6 @@ def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, t
     assert not list(tmp_path.rglob("stray0.parquet"))
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("place", ["../../private/chunk-000", -1, 0.5, None])
 def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, place):
@@ -271,7 +266,6 @@ def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, p
         command(dataset, tmp_path)
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("name", ["../../../strangers/private", "../../private", "PRIVATE", "..", "", "a/b", "a\0b"])
 def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, name):
@@ -284,7 +278,6 @@ def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, nam
     assert list(tmp_path.rglob("secret.txt")) == [outside / "secret.txt"]
 
 
-@unsafe
 @both_commands
 def test_an_image_in_a_file_elsewhere_is_not_read(dataset, tmp_path, command):
     """Hugging Face's `datasets` would open what the table names in place of an image, and download it."""
@@ -294,7 +287,6 @@ def test_an_image_in_a_file_elsewhere_is_not_read(dataset, tmp_path, command):
         command(dataset, tmp_path)
 
 
-@unsafe
 def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
     (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
     change_image(dataset, RGB, None, tmp_path / "secret.png")
@@ -305,7 +297,6 @@ def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
 # Sizes are checked first
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize(
     ("key", "data", "size"),
@@ -323,14 +314,12 @@ def test_images_are_no_larger_than_declared(dataset, tmp_path, command, key, dat
         command(dataset, tmp_path)
 
 
-@unsafe
 def test_an_image_without_bytes_is_none(dataset, tmp_path):
     change_image(dataset, RGB, b"")
     with pytest.raises(ValueError, match="no image"):
         look(dataset, tmp_path)
 
 
-@unsafe
 def test_videos_are_no_larger_than_declared(dataset, tmp_path):
     make_video_feature(dataset)
     file = dataset / "videos" / RGB / "chunk-000" / "file-000.mp4"
@@ -344,7 +333,6 @@ def test_videos_are_no_larger_than_declared(dataset, tmp_path):
         look(dataset, tmp_path)
 
 
-@unsafe
 @pytest.mark.parametrize(
     "shape", [[10**9, 10**9, 3], [20_000, 20_000, 3], [-8, 8, 3], [0, 8, 3], [152, 152], [152.5, 152, 3], "huge", None]
 )
@@ -354,7 +342,6 @@ def test_declared_shapes_of_images_are_possible(dataset, shape):
         SourceDataset(dataset)
 
 
-@unsafe
 def test_there_are_no_more_episodes_than_declared(dataset):
     """Rows that are alike take next to nothing in a file."""
     table = pq.read_table(dataset / EPISODES)
@@ -363,7 +350,6 @@ def test_there_are_no_more_episodes_than_declared(dataset):
         len(SourceDataset(dataset).episodes)
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize(
     ("column", "value"),
@@ -384,7 +370,6 @@ def test_episodes_are_where_there_are_frames(dataset, tmp_path, command, column,
         command(dataset, tmp_path)
 
 
-@unsafe
 @both_commands
 def test_rows_are_no_larger_than_declared(dataset, tmp_path, command):
     """64 MiB of zeros that a table of a few kilobytes unpacks to."""
@@ -393,14 +378,12 @@ def test_rows_are_no_larger_than_declared(dataset, tmp_path, command):
         command(dataset, tmp_path)
 
 
-@unsafe
 @pytest.mark.parametrize("view", VIEWS)
 def test_views_are_of_a_possible_size(view):
     with pytest.raises(ValueError, match="size must"):
         make_view(view, size=10**6)
 
 
-@unsafe
 @pytest.mark.parametrize(
     "facts",
     [
@@ -419,7 +402,6 @@ def test_a_policy_takes_over_only_what_can_be_a_view(with_views, facts):
         make_config().set_dataset_feature_metadata(features)
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("workspace", [{"size": 1e400}, {"size": 0.4, "command": "rm"}, {"center": "ab"}, "here"])
 def test_a_dataset_states_a_possible_workspace(dataset, tmp_path, command, workspace):
@@ -428,14 +410,12 @@ def test_a_dataset_states_a_possible_workspace(dataset, tmp_path, command, works
         command(dataset, tmp_path)
 
 
-@unsafe
 @pytest.mark.parametrize("entries", [{"size": float("nan")}, {"height_limit": 1e400}, {"center": [float("nan"), 0]}])
 def test_a_workspace_is_finite(entries):
     with pytest.raises(CalibrationError, match="finite"):
         parse_workspace(entries)
 
 
-@unsafe
 def test_networks_are_of_a_possible_width():
     with pytest.raises(ValueError, match=r"--policy\.width"):
         SymviewBcConfig(device="cpu", width=16 * 10**5)
@@ -454,14 +434,12 @@ def test_saved_arrays_are_no_larger_than_their_files(checkpoint, tmp_path):
         replay.load(tmp_path / "replay")
 
 
-@unsafe
 def test_a_narrow_image_is_not_enlarged_without_limit(workspace):
     camera = make_camera(size=152)
     picture = with_outline(np.zeros((1, 400, 3), np.uint8), camera, workspace)
     assert max(picture.shape) <= 4 * TILE
 
 
-@unsafe
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -477,7 +455,6 @@ def test_a_calibration_that_grows_or_ends_in_a_traceback_is_refused(tmp_path, te
         read_calibration(tmp_path / "cameras.yaml")
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("content", [b"[1]", b"\xff\xfe", b"[" * 100_000, b"{", b'{"codebase_version": "v3.0"}'])
 def test_metadata_that_is_none_is_refused(dataset, tmp_path, command, content):
@@ -486,7 +463,6 @@ def test_metadata_that_is_none_is_refused(dataset, tmp_path, command, content):
         command(dataset, tmp_path)
 
 
-@unsafe
 @both_commands
 @pytest.mark.parametrize("feature", ["image", [], {}, {"dtype": "image", "shape": [8, 8, 3], "info": "mine"}])
 def test_features_that_are_none_are_refused(dataset, tmp_path, command, feature):
@@ -496,7 +472,6 @@ def test_features_that_are_none_are_refused(dataset, tmp_path, command, feature)
         command(dataset, tmp_path)
 
 
-@unsafe
 @pytest.mark.parametrize("entries", [{"chunks_size": 0}, {"chunks_size": "x"}, {"total_frames": "many"}])
 def test_counts_in_metadata_are_counts(dataset, tmp_path, entries):
     change_info(dataset, **entries)
@@ -529,7 +504,6 @@ def strange_step(tmp_path, monkeypatch):
     sys.modules.pop("strange_steps", None)
 
 
-@unsafe
 @pytest.mark.parametrize("name", ["policy_preprocessor.json", "policy_postprocessor.json"])
 def test_a_processor_file_imports_nothing(checkpoint, strange_step, tmp_path, name):
     add_step(checkpoint, {"class": strange_step}, name)
@@ -538,7 +512,6 @@ def test_a_processor_file_imports_nothing(checkpoint, strange_step, tmp_path, na
     assert not (tmp_path / "run").exists()
 
 
-@unsafe
 @pytest.mark.parametrize(
     ("called", "options"),
     [
@@ -555,7 +528,6 @@ def test_a_processor_file_calls_nothing(checkpoint, tmp_path, called, options):
     assert not (tmp_path / "run").exists()
 
 
-@unsafe
 def test_processors_alone_import_nothing_either(checkpoint, strange_step, tmp_path):
     """As a robot's own program loads them, without or before the policy."""
     add_step(checkpoint, {"class": strange_step})
@@ -564,7 +536,6 @@ def test_processors_alone_import_nothing_either(checkpoint, strange_step, tmp_pa
     assert not (tmp_path / "run").exists()
 
 
-@unsafe
 def test_a_registered_step_that_runs_code_from_the_hub_is_not_made(checkpoint, monkeypatch):
     """LeRobot's `action_tokenizer_processor` trusts what the repository that it is told to load brings along."""
     loaded = []
@@ -584,7 +555,6 @@ def test_a_registered_step_that_runs_code_from_the_hub_is_not_made(checkpoint, m
     assert not loaded
 
 
-@unsafe
 @pytest.mark.parametrize("file", ["../weights.safetensors", "WEIGHTS"])
 def test_the_state_of_a_step_is_in_the_policys_folder(checkpoint, tmp_path, file):
     shutil.copy(checkpoint / "model.safetensors", tmp_path / "weights.safetensors")
@@ -594,7 +564,6 @@ def test_the_state_of_a_step_is_in_the_policys_folder(checkpoint, tmp_path, file
         load_with_processors(checkpoint)
 
 
-@unsafe
 def test_a_processor_file_makes_views_of_a_possible_size(checkpoint):
     add_step(checkpoint, {"registry_name": "symview_views", "config": {"views": {"persp": {"size": 10**6}}}})
     with pytest.raises(ValueError, match="size must"):

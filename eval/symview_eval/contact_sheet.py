@@ -58,7 +58,7 @@ def page(title: str, rows: list[Row], warnings: list[str]) -> str:
 
 def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -> NDArray[np.uint8]:
     """Draw the workspace's border on the table (red) and at its height limit (yellow) into a camera's image."""
-    scale = max(1, round(2 * TILE / rgb.shape[0]))
+    scale = max(1, round(2 * TILE / max(rgb.shape[:2])))
     picture = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
     draw = ImageDraw.Draw(picture)
     for height, color in ((workspace.height_limit, CEILING), (0.0, OUTLINE)):

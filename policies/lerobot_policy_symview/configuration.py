@@ -13,6 +13,7 @@ from lerobot_policy_symview.groups import GROUP_NAMES, make_group
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.symmetry import Symmetry, ThetaRepresentation
 from lerobot_symview import keys
+from lerobot_symview.calibration import parse_calibration, parse_workspace
 from lerobot_symview.names import added, lookup
 from lerobot_symview.views import VIEWS, View, make_view
 from lerobot_symview.workspace import Workspace
@@ -114,8 +115,8 @@ class SymviewConfig(PreTrainedConfig):
                 setattr(self, name, value)
         for name, choices in CHOICES.items():
             self._check_choice(name, choices)
-        if self.width < 16 or self.width % 16:
-            raise ValueError(f"--policy.width must be a positive multiple of 16, got {self.width}")
+        if not 16 <= self.width <= 1024 or self.width % 16:
+            raise ValueError(f"--policy.width must be a multiple of 16 up to 1024, got {self.width}")
         if not 0 <= self.weight_averaging < 1:
             raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
         self._check_combination()
@@ -241,9 +242,16 @@ class SymviewConfig(PreTrainedConfig):
             symmetry.check(size, key, names)
         made = features.get(self.color_key, {}).get("info") or {}
         if self.is_computed and "symview" in made:
-            self.view_options = dict(made["symview"]["options"])
-            self.workspace = dict(made["symview"]["workspace"])
-            self.calibration = dict(made["symview"].get("calibration", self.calibration))
+            try:
+                self.view_options = dict(made["symview"]["options"])
+                self.workspace = dict(made["symview"]["workspace"])
+                self.calibration = dict(made["symview"].get("calibration", self.calibration))
+                self._made_view()
+                parse_workspace(self.workspace)
+                if self.calibration:
+                    parse_calibration(self.calibration)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ValueError(f"the dataset does not say how {self.color_key} was made: {error}") from None
         else:
             raw = features.get(self.raw_keys[0], {}).get("info") or {}
             self.workspace = dict(raw.get("symview", {}).get("workspace", self.workspace))

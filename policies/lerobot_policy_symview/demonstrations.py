@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader
 
 from lerobot_symview import keys
 from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_symview.source_dataset import SourceDataset
 from lerobot_symview.staging import plain
 from symview_sim.settings import EnvSettings
 
@@ -32,7 +33,12 @@ def open_dataset(target: DatasetTarget) -> Any:
     folder = target.folder()
     if not (folder / "meta" / "info.json").is_file():
         raise CommandError(f"there is no dataset in {folder}: use --dataset.root, or symview-generate to make one")
-    return LeRobotDataset(target.repo_id, root=folder, depth_output_unit="m", video_backend="pyav")
+    source = SourceDataset(folder)
+    dataset = LeRobotDataset(target.repo_id, root=folder, depth_output_unit="m", video_backend="pyav")
+    for key in (key for key, feature in source.features.items() if feature["dtype"] == "image"):
+        if any(chunk.field("bytes").null_count for chunk in dataset.hf_dataset.data.column(key).chunks):
+            raise CommandError(f"{key} of the dataset in {folder} names files, expected images in its tables")
+    return dataset
 
 
 def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:

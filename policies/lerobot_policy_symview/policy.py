@@ -6,7 +6,8 @@ from abc import abstractmethod
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from lerobot_policy_symview.encoders import make_encoder
 from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.point_encoder import POINTS
+from lerobot_policy_symview.processor_files import check_processor_files
 from lerobot_policy_symview.processor_views import metres
 from lerobot_policy_symview.state_input import StateInput, camera_directions
 from lerobot_policy_symview.symmetry import Motion, Symmetry
@@ -92,6 +94,17 @@ class SymviewPolicy(PreTrainedPolicy):
         for name, (center, width) in {"action": action, "state": state}.items():
             self.register_buffer(f"{name}_center", center)
             self.register_buffer(f"{name}_width", width)
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
+        """Load a policy, as LeRobot does, unless the processor files beside it ask for more than ours.
+
+        Raises:
+            ValueError: if they do.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **options)
+        check_processor_files(policy.config, str(pretrained_name_or_path), options)
+        return policy
 
     @abstractmethod
     def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:

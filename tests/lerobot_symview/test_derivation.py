@@ -74,7 +74,7 @@ FORKING = f"""
 import os, pathlib, sys
 import cv2, datasets
 from lerobot_symview import add_views, derivation
-from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.hub import PushedDataset
 from lerobot_symview.views import *
 from tests.lerobot_symview.test_views import make_frame
 cv2.setNumThreads(0)  # threads do not survive a fork
