@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
 from lerobot.scripts import lerobot_eval
@@ -15,6 +16,7 @@ from symview_eval.experiments.experiment import ExperimentConfig, run_experiment
 from symview_eval.experiments.grid import EXPERIMENTS
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
+from symview_eval.experiments.summary import entries
 
 
 def config(folder, **chosen):
@@ -151,3 +153,12 @@ def test_wrong_use_is_answered_in_one_line(arguments, message, monkeypatch, caps
 def test_a_report_of_nothing_says_what_to_do(tmp_path):
     with pytest.raises(CommandError, match="run symview-experiment table1 first"):
         report(ReportConfig(tmp_path))
+
+
+def test_the_committed_results_are_what_the_report_is_made_of(tmp_path):
+    results = Path(__file__).parents[3] / "results"
+    page = report(ReportConfig(results, tmp_path)).read_text()
+    assert "made with other settings" not in page
+    table = EXPERIMENTS["table1"]
+    found = entries(table, "laptop", results)
+    assert sum(len(entry.results) for entry in found) == len(list((results / "table1" / "laptop").rglob("*.csv")))
