@@ -10,6 +10,7 @@ from symview_eval.report import read_success
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked_kernels")
 def test_twenty_demonstrations_suffice_with_symmetry_seen_from_above_and_not_without(tmp_path, monkeypatch):
     """The same demonstrations, steps and episodes for both; docs/policies.md has the rates that were measured."""
     config = DemoConfig(output_dir=tmp_path)

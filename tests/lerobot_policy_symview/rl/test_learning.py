@@ -1,36 +1,30 @@
 """What the paper is about, by reinforcement learning: symmetry, seen from above, learns sooner."""
 
+import shutil
 import statistics
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.records import read_table
-from lerobot_policy_symview.rl.train_rl import train_rl
 from symview_sim.generate import GenerateConfig, generate
-from symview_sim.settings import NewDataset, RecordedDataset
+from symview_sim.settings import NewDataset
 
 
 def learning_curve(data, folder, method):
     """Success after every 150 steps, from a camera at 45 degrees."""
-    policy = SymviewSacfdConfig(
-        device="cpu", method=method, width=16, crop_size=64, expert_weight=10, weight_averaging=0.99
-    )
-    config = TrainRlConfig(
-        dataset=RecordedDataset("test/picking", data),
-        policy=policy,
-        output_dir=folder,
-        steps=600,
-        batch_size=32,
-        eval_every=150,
-        eval_episodes=40,
-    )
-    train_rl(config)
+    command = [shutil.which("symview-train-rl", path=Path(sys.executable).parent), f"--dataset.root={data}"]
+    command += ["--policy.device=cpu", f"--policy.method={method}", "--policy.width=16", "--policy.crop_size=64"]
+    command += ["--policy.expert_weight=10", "--policy.weight_averaging=0.99", "--batch_size=32", "--steps=600"]
+    command += ["--eval_every=150", "--eval_episodes=40", f"--output_dir={folder}"]
+    subprocess.run(command, check=True)
     return [row["success"] for row in read_table(folder / "evaluation.csv")]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked_kernels")
 def test_twenty_demonstrations_suffice_and_symmetry_learns_sooner(tmp_path):
     """Block picking; docs/reinforcement.md has the rates that were measured."""
     data = generate(GenerateConfig(NewDataset("test/picking", tmp_path / "data"), num_episodes=20))
