@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 def unchecked_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let commands in processes of their own train as fast as for users: with every index checked it takes 3.5 times."""
+    """Let commands in processes of their own train as fast as for users: checking indices takes 3.5 times as long."""
     monkeypatch.setenv("NUMBA_BOUNDSCHECK", "0")
     monkeypatch.setenv("NUMBA_CACHE_DIR", f"{os.environ['NUMBA_CACHE_DIR']}-unchecked")
 
