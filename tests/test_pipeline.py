@@ -11,6 +11,7 @@ import pytest
 from symview_eval.demo import DemoConfig, demo
 from symview_eval.report import read_losses, read_success
 
+pytestmark = pytest.mark.xdist_group("demo")  # one process makes what they share
 BIN = Path(sys.executable).parent
 
 

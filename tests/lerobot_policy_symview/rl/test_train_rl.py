@@ -30,6 +30,8 @@ from lerobot_symview.placement import CameraSpec
 from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.lerobot_policy_symview.test_training import train
 
+pytestmark = pytest.mark.xdist_group("train_rl")  # one process makes what they share
+
 
 def make_config(recorded, folder, **options):
     policy = SymviewSacfdConfig(device="cpu", width=16, crop_size=64, **options.pop("policy", {}))

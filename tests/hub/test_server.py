@@ -15,7 +15,9 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 
-from tests.hub_server import ALICE, BOB, LFS_SIZE, HubServer, online
+from tests.hub.client import online
+from tests.hub.server import ALICE, BOB, HubServer
+from tests.hub.storage import LFS_SIZE
 
 FILES = {
     "README.md": b"---\nlicense: mit\n---\n# Demo\n",

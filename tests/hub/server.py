@@ -21,103 +21,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 import re
 import secrets
-import tempfile
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 from urllib.parse import parse_qs, unquote, urlsplit
 
+from tests.hub.storage import LFS_SIZE, LFS_SUFFIXES, Blob, Commit, HubError, Repo, git_hash
+
 ALICE, BOB = "hf_alice", "hf_bob"  # tokens of the users there are by default
-LFS_SUFFIXES = (".parquet", ".safetensors", ".png", ".mp4")
-LFS_SIZE = 1_000_000  # a larger file goes to LFS whatever its name
-GITATTRIBUTES = "".join(f"*{suffix} filter=lfs diff=lfs merge=lfs -text\n" for suffix in LFS_SUFFIXES)
-
-
-class HubError(Exception):
-    """An answer other than 200; `code` is what the client tells its exceptions by."""
-
-    def __init__(
-        self, status: int, message: str, code: str = "", headers: dict[str, str] | None = None, **body: Any
-    ) -> None:
-        super().__init__(message)
-        self.status = status
-        self.headers = {"X-Error-Message": message} | ({"X-Error-Code": code} if code else {}) | (headers or {})
-        self.body = {"error": message} | body
-
-
-@dataclass(frozen=True)
-class Blob:
-    """A file's content; git itself holds only a pointer to one that is in LFS."""
-
-    content: bytes
-    is_lfs: bool = False
-
-    @cached_property
-    def sha256(self) -> str:
-        return hashlib.sha256(self.content).hexdigest()
-
-    @cached_property
-    def pointer(self) -> bytes:
-        size = len(self.content)
-        return f"version https://git-lfs.github.com/spec/v1\noid sha256:{self.sha256}\nsize {size}\n".encode()
-
-    @cached_property
-    def oid(self) -> str:
-        return git_hash(self.pointer if self.is_lfs else self.content)
-
-    @property
-    def etag(self) -> str:
-        """What the client compares with its own file."""
-        return self.sha256 if self.is_lfs else self.oid
-
-
-@dataclass(frozen=True)
-class Commit:
-    """A state of all files; the same history has the same `oid` on every server."""
-
-    files: dict[str, Blob]
-    title: str
-    parent: Commit | None = None
-
-    @cached_property
-    def oid(self) -> str:
-        tree = {path: blob.oid for path, blob in self.files.items()}
-        return git_hash(json.dumps([self.parent and self.parent.oid, self.title, tree], sort_keys=True).encode())
-
-
-@dataclass
-class Repo:
-    """A model's or a dataset's repository."""
-
-    kind: str
-    repo_id: str
-    private: bool
-    branches: dict[str, Commit] = field(default_factory=dict)
-    tags: dict[str, Commit] = field(default_factory=dict)
-    commits: dict[str, Commit] = field(default_factory=dict)
-    objects: dict[str, bytes] = field(default_factory=dict)  # of LFS, by SHA-256, committed or not
-
-    def __post_init__(self) -> None:
-        self.add("main", Commit({".gitattributes": Blob(GITATTRIBUTES.encode())}, "initial commit"))
-
-    def add(self, branch: str, commit: Commit) -> None:
-        self.branches[branch] = self.commits[commit.oid] = commit
-
-    def at(self, revision: str) -> Commit:
-        for commits in (self.branches, self.tags, self.commits):
-            if revision in commits:
-                return commits[revision]
-        raise HubError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
 
 
 class HubServer(ThreadingHTTPServer):
@@ -179,10 +94,6 @@ def route(method: str, pattern: str, write: bool = False) -> Callable[[Callable[
         return function
 
     return register
-
-
-def git_hash(content: bytes) -> str:
-    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -406,41 +317,3 @@ class _Handler(BaseHTTPRequestHandler):
         commit = Commit(files, header["summary"], parent)
         repo.add(revision, commit)
         return {"success": True, "commitUrl": f"{self.address(repo)}/commit/{commit.oid}", "commitOid": commit.oid}
-
-
-@contextmanager
-def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iterator[None]:
-    """Let this process' client, and LeRobot, find `hub` where they look for the Hugging Face Hub, and nothing else.
-
-    Downloads go to a cache of their own, since the client takes from a cache what the Hub refuses; it is deleted at
-    the end unless `cache` names a folder for it. Retries do not wait. It may be nested, for another user's view.
-    """
-    import httpx
-    from huggingface_hub import constants, set_client_factory
-    from huggingface_hub.utils import _http
-
-    class Delivery(httpx.HTTPTransport):
-        def handle_request(self, request: httpx.Request) -> httpx.Response:
-            url = hub.url + request.url.raw_path.decode()
-            return super().handle_request(
-                httpx.Request(
-                    request.method, url, headers=request.headers, stream=request.stream, extensions=request.extensions
-                )
-            )
-
-    def client() -> httpx.Client:
-        hooks = {"request": [_http.hf_request_event_hook]}
-        return httpx.Client(transport=Delivery(), event_hooks=hooks, follow_redirects=True, timeout=None)
-
-    with ExitStack() as stack:
-        folder = cache or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="symview-hub-")))
-        stack.enter_context(mock.patch.dict(os.environ, {"HF_TOKEN": token or "", "HUGGING_FACE_HUB_TOKEN": ""}))
-        changed = {"HF_HUB_OFFLINE": False, "HF_HUB_DISABLE_XET": True, "HF_HUB_DISABLE_TELEMETRY": True}
-        changed |= {"HF_HUB_CACHE": str(folder / "hub"), "HF_TOKEN_PATH": str(folder / "token")}
-        stack.enter_context(mock.patch.multiple(constants, **changed))
-        for module in ("dataset_metadata", "lerobot_dataset"):  # which have copies of it
-            stack.enter_context(mock.patch(f"lerobot.datasets.{module}.HF_LEROBOT_HUB_CACHE", folder / "lerobot"))
-        stack.enter_context(mock.patch.object(_http, "time", SimpleNamespace(sleep=lambda seconds: None)))
-        stack.callback(set_client_factory, _http._GLOBAL_CLIENT_FACTORY)  # also closes the connections
-        set_client_factory(client)
-        yield

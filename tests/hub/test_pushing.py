@@ -20,7 +20,8 @@ from lerobot_symview.cli import CommandError
 from lerobot_symview.hub import PushedDataset, push_dataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
-from tests.hub_server import ALICE, BOB, HubServer, online
+from tests.hub.client import online
+from tests.hub.server import ALICE, BOB, HubServer
 from tests.lerobot_policy_symview.test_training import train
 
 

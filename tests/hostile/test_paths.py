@@ -1,0 +1,101 @@
+"""Paths that a dataset states stay in it."""
+
+import numpy as np
+import pytest
+
+from lerobot_policy_symview.demonstrations import open_dataset
+from lerobot_symview.cli import CommandError, DatasetTarget
+from tests.hostile.files import (
+    DATA,
+    EPISODES,
+    RGB,
+    both_commands,
+    change_columns,
+    change_feature,
+    change_image,
+    change_info,
+    derive,
+    encoded,
+    make_video_feature,
+)
+
+TEMPLATES = [
+    "../private/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "data/../../private/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "PRIVATE/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+    "data/chunk-{chunk_index.__class__}/file-{file_index:03d}.parquet",
+    "data/chunk-{chunk_index!r}/file-{file_index:03d}.parquet",
+    "data/chunk-{chunk_index:0300000d}/file-{file_index:03d}.parquet",
+    "data/chunk-{0}/file-{file_index:03d}.parquet",
+    "data/chunk-{somewhere}/file-{file_index:03d}.parquet",
+    "data/chunk-{chunk_index:03d",
+    "",
+    None,
+    ["data"],
+]
+
+
+@both_commands
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template):
+    stated = template.replace("PRIVATE", str(outside)) if isinstance(template, str) else template
+    change_info(dataset, data_path=stated)
+    with pytest.raises(CommandError, match="data_path"):
+        command(dataset, tmp_path)
+
+
+@both_commands
+@pytest.mark.parametrize("template", [*TEMPLATES[:-3], "videos/{video_key.__class__}/{video_key}.mp4"])
+def test_videos_are_in_the_dataset(dataset, outside, tmp_path, command, template):
+    make_video_feature(dataset, template.replace("PRIVATE", str(outside)))
+    with pytest.raises(CommandError, match="video_path"):
+        command(dataset, tmp_path)
+
+
+def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, tmp_path):
+    """With these numbers it is 77/77 in the source, and in the result, whose files are numbered from 0, ../.. ."""
+    folder = "{file_index!s:.>2.{chunk_index}s}"
+    change_info(dataset, data_path=f"{folder}/{folder}/stray{{file_index}}.parquet")
+    change_columns(dataset / EPISODES, **{"data/chunk_index": 2, "data/file_index": 77})
+    (dataset / "77" / "77").mkdir(parents=True)
+    (dataset / DATA).rename(dataset / "77" / "77" / "stray77.parquet")
+    with pytest.raises(CommandError, match="data_path"):
+        derive(dataset, tmp_path)
+    assert not list(tmp_path.rglob("stray0.parquet"))
+
+
+@both_commands
+@pytest.mark.parametrize("place", ["../../private/chunk-000", -1, 0.5, None])
+def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, place):
+    change_info(dataset, data_path="data/{chunk_index}/file-{file_index:03d}.parquet")
+    change_columns(dataset / EPISODES, **{"data/chunk_index": place})
+    with pytest.raises(CommandError, match="chunk_index"):
+        command(dataset, tmp_path)
+
+
+@both_commands
+@pytest.mark.parametrize("name", ["../../../strangers/private", "../../private", "PRIVATE", "..", "", "a/b", "a\0b"])
+def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, name):
+    """The videos of a feature are copied from the folder of its name to the folder of its name."""
+    (dataset / "videos").mkdir()
+    video = {"dtype": "video", "shape": [8, 8, 3], "names": ["height", "width", "channels"], "info": {}}
+    change_feature(dataset, name.replace("PRIVATE", str(outside)), **video)
+    with pytest.raises(CommandError, match=r"info\.json: the feature"):
+        command(dataset, tmp_path)
+    assert list(tmp_path.rglob("secret.txt")) == [outside / "secret.txt"]
+
+
+@both_commands
+def test_an_image_in_a_file_elsewhere_is_not_read(dataset, tmp_path, command):
+    """Hugging Face's `datasets` would open what the table names in place of an image, and download it."""
+    (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
+    change_image(dataset, RGB, None, tmp_path / "secret.png")
+    with pytest.raises(ValueError, match="image"):
+        command(dataset, tmp_path)
+
+
+def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
+    (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
+    change_image(dataset, RGB, None, tmp_path / "secret.png")
+    with pytest.raises(CommandError, match=RGB):
+        open_dataset(DatasetTarget("test/hostile", dataset))
