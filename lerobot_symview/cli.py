@@ -7,11 +7,13 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
+
+from lerobot_symview.names import lookup
 
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval")
@@ -88,6 +90,20 @@ def run_command[Config](
     except KeyboardInterrupt:
         _end(program, "interrupted", INTERRUPTED)
     sys.exit(0)
+
+
+def subcommand(kind: str, known: Mapping[str, object], default: str = "") -> str:
+    """Take the first argument, which names one of `known`, off the command line; a name that is not known ends it.
+
+    Without one it is `default`, which may be no name where only help or the version is asked for.
+    """
+    name = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else default
+    try:
+        if name or not {"-h", "--help", "--version"} & set(sys.argv[1:]):
+            lookup(kind, name, known)
+    except ValueError as error:
+        _end(Path(sys.argv[0]).name, str(error), USAGE)
+    return name
 
 
 def quiet() -> None:

@@ -53,10 +53,15 @@ def dataset_card(dataset: SourceDataset, repo_id: str, tags: list[str], has_pict
 
 
 def _metadata(tags: list[str]) -> str:
-    lines = ["---", "license: apache-2.0", "task_categories:", "- robotics", "tags:"]
-    lines += [f"- {json.dumps(tag)}" for tag in dict.fromkeys(tags)]
-    lines += ["configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---\n"]
-    return "\n".join(lines)
+    from huggingface_hub import DatasetCardData
+
+    data = DatasetCardData(
+        license="apache-2.0",
+        task_categories=["robotics"],
+        tags=list(dict.fromkeys(tags)),
+        configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
+    )
+    return f"---\n{data.to_yaml()}\n---\n"
 
 
 def _facts(dataset: SourceDataset) -> dict[str, Any]:

@@ -25,7 +25,7 @@ def read_info(folder: Path) -> dict[str, Any]:
     """
     file = folder / "meta" / "info.json"
     if not file.is_file():
-        raise CommandError(f"no dataset at {folder}: check --dataset.repo_id and --dataset.root")
+        raise CommandError(f"there is no dataset in {folder}: check --dataset.repo_id and --dataset.root")
     try:
         info = json.loads(file.read_text())
     except (ValueError, RecursionError) as error:

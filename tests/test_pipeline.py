@@ -195,9 +195,9 @@ print(tuple(preprocessor(observation)["observation.images.side_reproj"].shape))
             2,
             "elevation_deg must lie in (0, 90]",
         ),
-        (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "no dataset at"),
+        (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "there is no dataset in"),
         (("symview-add-views", "--dataset.repo_id=a/b", "--views=[reprojj]"), 2, "did you mean 'reproj'"),
-        (("symview-preview", "--dataset.repo_id=no/where"), 1, "no dataset at"),
+        (("symview-preview", "--dataset.repo_id=no/where"), 1, "there is no dataset in"),
         (("symview-demo", "--steps=0"), 2, "--steps must be at least 1, got 0"),
     ],
 )

@@ -14,8 +14,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_symview.cli import USAGE, run_command
-from lerobot_symview.names import lookup
+from lerobot_symview.cli import run_command, subcommand
 from symview_eval.clock import Clock
 from symview_eval.experiment_benchmark import ExperimentBenchmark, benchmark_experiment
 from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
@@ -189,12 +188,7 @@ SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
 
 def main() -> None:
     """Run the console command: the first argument names the suite."""
-    suite = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else "experts"
-    try:
-        config_class, measure = lookup("suite", suite, SUITES)
-    except ValueError as error:
-        sys.stderr.write(f"symview-benchmark: error: {error}\n")
-        sys.exit(USAGE)
+    config_class, measure = SUITES[subcommand("suite", SUITES, default="experts")]
     sys.argv = [
         argument.replace("--json", "--json=true") if argument == "--json" else argument for argument in sys.argv
     ]

@@ -231,6 +231,11 @@ class SymviewConfig(PreTrainedConfig):
         """Scalar channels of the network's picture."""
         return 3 + (self.modality == "rgbd") + (self.gripper_input == "image")
 
+    def limit_view(self) -> None:
+        """Have the view made no larger than the network sees, unless its size is stated."""
+        if self.is_computed:
+            self.view_options = {"size": self.image_size, **self.view_options}
+
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Choose the inputs among a dataset's `features`, and read the view's options and the workspace from them.
 

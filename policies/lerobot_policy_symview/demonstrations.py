@@ -31,8 +31,6 @@ def open_dataset(target: DatasetTarget) -> Any:
     from lerobot.datasets import LeRobotDataset
 
     folder = target.folder()
-    if not (folder / "meta" / "info.json").is_file():
-        raise CommandError(f"there is no dataset in {folder}: use --dataset.root, or symview-generate to make one")
     source = SourceDataset(folder)
     dataset = LeRobotDataset(target.repo_id, root=folder, depth_output_unit="m", video_backend="pyav")
     for key in (key for key, feature in source.features.items() if feature["dtype"] == "image"):

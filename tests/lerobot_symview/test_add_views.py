@@ -109,7 +109,7 @@ def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, wit
     [
         ({"camera": "wrist"}, ValueError, "calibrated cameras: .*side"),
         ({"keep": ["front"]}, ValueError, "--keep names .*front"),
-        ({"dataset": DatasetTarget("no/where")}, CommandError, "no dataset at"),
+        ({"dataset": DatasetTarget("no/where")}, CommandError, "there is no dataset in"),
     ],
 )
 def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, options, error, message):

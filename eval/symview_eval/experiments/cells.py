@@ -27,7 +27,6 @@ from symview_sim.settings import EnvSettings, NewDataset
 
 logger = logging.getLogger(__name__)
 
-DISCOUNT = 0.99  # paper A.3
 RL_SIMULATORS = 5
 
 
@@ -43,6 +42,17 @@ class Job:
     device: str
     """Of the networks."""
 
+    @property
+    def demonstrations(self) -> NewDataset:
+        """What the cell learns from."""
+        name = self.cell.recording
+        return NewDataset(f"symview/{name}", self.folder / "recordings" / name)
+
+    @property
+    def output(self) -> Path:
+        """Folder of its policy."""
+        return self.folder / "policies" / self.cell.path.with_suffix("")
+
 
 @dataclass(frozen=True)
 class Done:
@@ -54,32 +64,11 @@ class Done:
     """Why there is no result; empty if there is one."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """Demonstrations to make."""
-
-    folder: Path
-    """Where all of them are."""
-    name: str
-    task: str
-    elevation_deg: float
-    episodes: int
-    seed: int
-
-
-def recording(cell: Cell, folder: Path) -> Recording:
-    """Return the demonstrations that a cell learns from."""
-    return Recording(
-        _recordings(folder), cell.recording, cell.task, cell.row.elevation_deg, cell.demonstrations, cell.seed
-    )
-
-
-def record(wanted: Recording) -> str:
-    """Make demonstrations, unless they are there already, and return their name."""
-    env = RecordedEnv(task=wanted.task, camera=CameraSpec(elevation_deg=wanted.elevation_deg))
-    target = _dataset(wanted.folder, wanted.name)
-    generate(GenerateConfig(target, env=env, num_episodes=wanted.episodes, seed=wanted.seed, resume=True))
-    return wanted.name
+def record(job: Job) -> None:
+    """Make a cell's demonstrations, unless they are there already."""
+    cell = job.cell
+    env = RecordedEnv(task=cell.task, camera=CameraSpec(elevation_deg=cell.row.elevation_deg))
+    generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
 
 
 def run_cell(job: Job) -> Done:
@@ -105,16 +94,14 @@ def _run(job: Job, start: float) -> None:
         oracle=cell.row.policy["method"].startswith("oracle"),
         max_steps=cell.scale.max_steps,
     )
-    target = _dataset(_recordings(job.folder), cell.recording)
-    kept = job.folder / "policies" / cell.path.with_suffix("")
     times = Times()
     if cell.algorithm == "sacfd":
-        checkpoints = _reinforce(cell, target, env, kept, job.device)
+        checkpoints = _reinforce(job, env)
     else:
-        cloned = clone(cell, open_dataset(target), env, job.device, DISCOUNT)
+        cloned = clone(cell, open_dataset(job.demonstrations), env, job.device)
         checkpoints, actor, times = cloned.checkpoints, cloned.actor, cloned.times
         for part in (actor.policy, actor.preprocessor, actor.postprocessor):
-            part.save_pretrained(kept / "pretrained_model")
+            part.save_pretrained(job.output / "pretrained_model")
     origin = Origin(
         configuration=cell.configuration_hash,
         seed=cell.seed,
@@ -126,23 +113,21 @@ def _run(job: Job, start: float) -> None:
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
 
 
-def _reinforce(cell: Cell, target: NewDataset, env: EnvSettings, output: Path, device: str) -> list[Checkpoint]:
+def _reinforce(job: Job, env: EnvSettings) -> list[Checkpoint]:
     """Run `symview-train-rl`, or go on with it, and return its evaluations."""
-    scale = cell.scale
+    cell, scale = job.cell, job.cell.scale
     config = TrainRlConfig(
-        dataset=target,
+        dataset=job.demonstrations,
         env=env,
-        policy=SymviewSacfdConfig(
-            device=device, push_to_hub=False, discount=DISCOUNT, **scale.policy, **cell.row.policy
-        ),
-        output_dir=output,
+        policy=SymviewSacfdConfig(device=job.device, push_to_hub=False, **scale.policy, **cell.row.policy),
+        output_dir=job.output,
         steps=cell.steps,
         batch_size=scale.batch_size,
         num_simulators=RL_SIMULATORS,
         seed=cell.seed,
         eval_every=scale.rl_eval_every,
         eval_episodes=scale.eval_episodes,
-        resume=(output / "checkpoints" / "last").exists(),
+        resume=(job.output / "checkpoints" / "last").exists(),
     )
     train_rl(config)
     return [
@@ -153,16 +138,8 @@ def _reinforce(cell: Cell, target: NewDataset, env: EnvSettings, output: Path, d
             mean_return=row["return"],
             loss=float("nan"),
         )
-        for row in read_table(output / "evaluation.csv")
+        for row in read_table(job.output / "evaluation.csv")
     ]
-
-
-def _recordings(folder: Path) -> Path:
-    return folder / "recordings"
-
-
-def _dataset(recordings: Path, name: str) -> NewDataset:
-    return NewDataset(f"symview/{name}", recordings / name)
 
 
 def _machine(device: str) -> str:

@@ -18,6 +18,7 @@ from lerobot.utils.random_utils import set_seed
 from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.demonstrations import observations
 from lerobot_policy_symview.frames import FrameCodec
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
@@ -27,8 +28,6 @@ from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Times
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Simulators
-
-GRADIENT_NORM = 10.0  # lerobot-train cuts gradients there
 
 
 @dataclass(frozen=True)
@@ -117,12 +116,11 @@ def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
         **cell.scale.policy,
         **cell.row.policy,
     )
-    if config.is_computed:
-        config.view_options = {"size": config.image_size, **config.view_options}
+    config.limit_view()
     return config
 
 
-def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str, discount: float) -> Cloned:
+def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Cloned:
     """Train and evaluate a cell's policy, with LeRobot's own update."""
     scale = cell.scale
     begin, begin_cpu = time.perf_counter(), time.process_time()
@@ -131,7 +129,8 @@ def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str, discount: flo
     policy: Any = make_policy(config, ds_meta=dataset.meta)
     actor = Actor(policy)
     batches = Demonstrations(dataset, actor).batches(scale.batch_size, cell.seed)
-    optimizer: Any = config.get_optimizer_preset().build(policy.get_optim_params())
+    preset = config.get_optimizer_preset()
+    optimizer: Any = preset.build(policy.get_optim_params())
     schedule = config.get_scheduler_preset()
     scheduler = schedule.build(optimizer, scale.steps) if schedule is not None else None
     accelerator = Accelerator(cpu=device == "cpu")
@@ -140,12 +139,12 @@ def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str, discount: flo
     pending: list[tuple[int, float, Future[Evaluation]]] = []
     with (
         Simulators(observed(config, env), scale.simulators) as simulators,
-        Evaluator(simulators, scale.eval_episodes, first_seed, discount) as evaluator,
+        Evaluator(simulators, scale.eval_episodes, first_seed, SymviewSacfdConfig.discount) as evaluator,
     ):
         metrics = _metrics(scale.batch_size)
         ready = time.perf_counter()
         for step in range(1, scale.steps + 1):
-            update_policy(metrics, policy, next(batches), optimizer, GRADIENT_NORM, accelerator, scheduler)
+            update_policy(metrics, policy, next(batches), optimizer, preset.grad_clip_norm, accelerator, scheduler)
             if step % scale.eval_every == 0:
                 pending.append((step, metrics.loss.avg, evaluator.submit(policy)))
                 metrics.reset_averages()

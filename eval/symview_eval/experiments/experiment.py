@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_symview.cli import USAGE, CommandError, run_command
+from lerobot_symview.cli import CommandError, run_command, subcommand
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.names import lookup
 from symview_eval.experiments.grid import EXPERIMENTS, Cell, select
@@ -84,16 +84,15 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
 
 
 def _run(cells: Sequence[Cell], config: ExperimentConfig) -> None:
-    from symview_eval.experiments.cells import Done, Job, record, recording, run_cell
+    from symview_eval.experiments.cells import Done, Job, record, run_cell
 
     failures: list[Done] = []
     results, folder = config.results_dir.resolve(), config.output_dir.resolve()
     with EXECUTORS[config.executor](config.num_workers, "symview_eval.experiments.cells") as executor:
-        recordings = {one.name: one for one in (recording(cell, folder) for cell in cells)}
-        demonstrations = executor.run(record, recordings.values())
-        for _ in tqdm(demonstrations, desc="demonstrations", total=len(recordings), unit="dataset"):
-            pass
         jobs = [Job(cell, results, folder, config.device) for cell in cells]
+        recordings = {job.cell.recording: job for job in jobs}.values()
+        for _ in tqdm(executor.run(record, recordings), desc="demonstrations", total=len(recordings), unit="dataset"):
+            pass
         with tqdm(desc="cells", total=len(jobs), unit="cell") as bar:
             for done in executor.run(run_cell, jobs):
                 if done.failure:
@@ -110,14 +109,7 @@ def _run(cells: Sequence[Cell], config: ExperimentConfig) -> None:
 def main() -> None:
     """Run the console command: the first argument names the table or figure, or is `report`."""
     commands: dict[str, Any] = dict.fromkeys(EXPERIMENTS, run_experiment) | {"report": report}
-    name = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else ""
-    asks = {"-h", "--help", "--version"} & set(sys.argv[1:])
-    try:
-        if name or not asks:
-            lookup("experiment", name, commands)
-    except ValueError as error:
-        sys.stderr.write(f"symview-experiment: error: {error}\n")
-        sys.exit(USAGE)
+    name = subcommand("experiment", commands)
     if name == "report":
         run_command(ReportConfig, report, EXAMPLES)
     run_command(ExperimentConfig, lambda config: run_experiment(name, config), EXAMPLES)

@@ -88,8 +88,7 @@ class Training:
         space: Any = config.env.make().action_space
         policy = deepcopy(config.policy)
         policy.set_dataset_feature_metadata(dataset.meta.features)
-        if policy.is_computed:  # no larger than the network sees
-            policy.view_options.setdefault("size", policy.image_size)
+        policy.limit_view()
         self.policy = SymviewSacfdPolicy(policy, ranges(dataset, (space.low, space.high)))
         self.policy.to(policy.device)
         self.actor = Actor(self.policy)
