@@ -4,7 +4,7 @@ PYTHON := .venv/bin/python
 READY := .venv/.ready
 UV_VERSION := 0.13.9
 
-.PHONY: demo test lint setup doctor pins clean
+.PHONY: demo test lint docs setup doctor pins clean
 
 demo: $(READY) ## demonstrations, views, training, evaluation and a report in outputs/demo
 	@.venv/bin/symview-demo $(ARGS)
@@ -16,6 +16,9 @@ lint: $(READY)
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+docs: $(READY) ## the documentation, in outputs/site
+	@.venv/bin/zensical build --strict
 
 setup: $(READY) ## the environment alone, in .venv
 

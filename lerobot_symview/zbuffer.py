@@ -22,7 +22,7 @@ EMPTY = -1  # source of a cell that no point fell into
 class ZBuffer(NamedTuple):
     """What is highest in each cell of a top-down grid of P x P cells.
 
-    Args:
+    Attributes:
         height: (P, P) float32, metres above the table; 0 where nothing is.
         source: (P, P) int32, index of the point; `EMPTY` where nothing is.
     """

@@ -1,0 +1,60 @@
+"""Every page of the documentation, followed to the letter but for numbers."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from lerobot.datasets import LeRobotDataset, remove_feature
+
+from lerobot_symview import keys, names
+from lerobot_symview.placement import CameraSpec
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
+from tests.hostile.files import change_feature
+from tests.hub.client import online
+from tests.hub.server import ALICE, HubServer
+
+PROSE = ("index.md", "reference.md")  # lists of other pages
+
+
+def real_dataset(folder: Path) -> None:
+    """Record what a robot's own dataset would have: a camera and joints, no calibration and no gripper's pose."""
+    pose = (0, 0.70711, -0.70711, 1.02, 1, 0, 0, 0, 0, -0.70711, -0.70711, 0.57, 0, 0, 0, 1)
+    camera = CameraSpec("front", 480, 640, intrinsics=(615.3, 0, 319.5, 0, 615.1, 239.5, 0, 0, 1), world_from_cam=pose)
+    env = RecordedEnv(camera=camera, oracle=False)
+    whole = generate(GenerateConfig(NewDataset("test/whole", folder.with_name("whole")), env, num_episodes=1))
+    unknown = [keys.intrinsics("front"), keys.world_from_cam("front")]
+    remove_feature(LeRobotDataset("test/whole", root=whole), unknown, folder, "test/real")
+    joints = [f"joint_{number}" for number in range(5)]
+    change_feature(folder, keys.STATE, names=joints)
+    calibration = (block.text for block in blocks(ROOT / "docs" / "own_camera.md") if block.language == "yaml")
+    Path("cameras.yaml").write_text(next(calibration))
+
+
+@pytest.fixture
+def reader(request, tmp_path, monkeypatch, recorded, with_views):
+    """Somebody with the datasets that the page takes for granted, and a Hub."""
+    page = request.param
+    monkeypatch.chdir(tmp_path)
+    reader = Reader(page.stem, monkeypatch)
+    made = {
+        "me/picking": lambda folder: shutil.copytree(recorded, folder),
+        "me/picking_views": lambda folder: shutil.copytree(with_views, folder),
+        "me/real": real_dataset,
+    }
+    for name in needs(page):
+        made[name](reader.dataset(name.removeprefix("me/")))
+    with HubServer() as hub, online(hub, ALICE):
+        hub.users[ALICE] = (page.stem, {page.stem})
+        yield page, reader
+    shutil.rmtree(reader.dataset(""), ignore_errors=True)
+    names.added.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "reader", [README, *(page for page in PAGES if page.name not in PROSE)], indirect=True, ids=lambda page: page.stem
+)
+def test_a_page_does_what_it_says(reader):
+    page, somebody = reader
+    assert somebody.follow(page) > 0
