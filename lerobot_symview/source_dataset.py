@@ -156,9 +156,13 @@ class SourceDataset:
         with av.open(str(file)) as container:
             stream = container.streams.video[0]
             self._check_size(key, stream.height, stream.width)
+            rate = float(stream.average_rate)
         is_depth = is_depth_feature(self.features[key])
         for first in range(0, len(timestamps), VIDEO_FRAMES):
             moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
+            between = (max(moments) - min(moments)) * rate
+            if not between < 2 * VIDEO_FRAMES:
+                raise CommandError(f"{file}: {len(moments)} frames of {key} lie {between:.0f} frames of video apart")
             images = decode_video_frames(file, moments, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
             if is_depth:
                 coding = DepthEncoderConfig.from_video_info(info)

@@ -31,6 +31,7 @@ KINDS = ("x", "y", "rx", "ry", "z", "yaw", "sign", "aperture", "scalar")
 PAIRS = {"x": "y", "rx": "ry"}
 REPEATED = ("sign", "scalar")  # kinds that need no name to be there several times
 SMALLEST_EXTENT = 1e-6
+MOST_ENTRIES = 256
 ThetaRepresentation = Literal["sign", "trivial"]
 
 
@@ -82,6 +83,8 @@ class Symmetry:
     flag: str = "the declaration"
 
     def __post_init__(self) -> None:
+        if len(self.entries) > MOST_ENTRIES:
+            raise ValueError(f"{self.flag} has {len(self.entries)} entries, more than {MOST_ENTRIES}")
         unknown = sorted({entry for entry in self.entries if entry.split(":")[0] not in KINDS})
         if unknown:
             raise ValueError(f"{self.flag} has unknown kinds {unknown}, expected any of: {', '.join(KINDS)}")

@@ -21,6 +21,7 @@ from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.conftest import make_camera
 from tests.hostile.files import (
+    DATA,
     DEPTH,
     EPISODES,
     RGB,
@@ -28,6 +29,7 @@ from tests.hostile.files import (
     change_columns,
     change_feature,
     change_image,
+    derive,
     encoded,
     look,
     make_video_feature,
@@ -61,17 +63,35 @@ def test_an_image_without_bytes_is_none(dataset, tmp_path):
         look(dataset, tmp_path)
 
 
-def test_videos_are_no_larger_than_declared(dataset, tmp_path):
+def write_video(dataset, height, width, frames):
     make_video_feature(dataset)
     file = dataset / "videos" / RGB / "chunk-000" / "file-000.mp4"
     file.parent.mkdir(parents=True)
     with av.open(str(file), "w") as container:
-        stream = container.add_stream("mpeg4", rate=4, width=320, height=304, pix_fmt="yuv420p")
-        for _ in range(16):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((304, 320, 3), np.uint8))))
+        stream = container.add_stream("mpeg4", rate=4, width=width, height=height, pix_fmt="yuv420p")
+        for _ in range(frames):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((height, width, 3), np.uint8))))
         container.mux(stream.encode())
+
+
+def test_videos_are_no_larger_than_declared(dataset, tmp_path):
+    write_video(dataset, 304, 320, frames=16)
     with pytest.raises(ValueError, match=r"304 x 320.*152 x 152"):
         look(dataset, tmp_path)
+
+
+def test_no_more_of_a_video_is_decoded_than_there_are_frames(dataset, tmp_path):
+    """All from the first wanted moment to the last is decoded at a time."""
+    write_video(dataset, 152, 152, frames=400)
+    moments = pq.read_table(dataset / DATA)["timestamp"].to_numpy() * 50
+    change_columns(dataset / DATA, timestamp=pa.array(moments, pa.float32()))
+    with pytest.raises(CommandError, match="frames of video apart"):
+        derive(dataset, tmp_path)
+
+
+def test_declarations_of_symmetry_are_no_longer_than_a_robot_has_entries():
+    with pytest.raises(ValueError, match=r"--policy\.state_symmetry has 100000 entries"):
+        SymviewBcConfig(device="cpu", gripper_input="vector", state_symmetry=["scalar"] * 10**5)
 
 
 @pytest.mark.parametrize(
