@@ -10,7 +10,7 @@ from typing import Any
 
 
 @contextmanager
-def _silenced() -> Iterator[None]:
+def silenced() -> Iterator[None]:
     """Discard what C code writes to standard output and standard error meanwhile."""
     libc = ctypes.CDLL(None)
     libc.fflush(None)
@@ -28,7 +28,7 @@ def _silenced() -> Iterator[None]:
         os.close(null)
 
 
-with _silenced():
+with silenced():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
@@ -40,7 +40,7 @@ class _Client(BulletClient):
 
 def connect() -> Any:
     """Return a new simulator without a window; its methods are PyBullet's functions bound to this simulator."""
-    with _silenced():
+    with silenced():
         return _Client(connection_mode=pybullet.DIRECT)
 
 
@@ -49,4 +49,4 @@ def disconnect(client: Any) -> None:
     client.disconnect()
 
 
-__all__ = ["connect", "disconnect", "pybullet"]
+__all__ = ["connect", "disconnect", "pybullet", "silenced"]

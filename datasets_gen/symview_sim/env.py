@@ -163,6 +163,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             if self._depth:
                 observation[_env_key(keys.depth(name))] = picture.depth[None]
             if self._segmentation:
+                assert picture.labels is not None
                 labels = np.repeat(picture.labels[..., None], 3, axis=-1)
                 observation["pixels"][_camera_name(keys.segmentation(name))] = labels
             observation[_env_key(keys.intrinsics(name))] = camera.intrinsics.ravel().astype(np.float32)
@@ -172,7 +173,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _picture(self, spec: CameraSpec) -> Picture:
         camera = self.cameras[spec.name]
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
-            picture = render(self.scene.client, camera)
+            picture = render(self.scene.client, camera, labelled=self._segmentation)
         if spec.depth_noise == spec.depth_dropout == 0:
             return picture
         return picture._replace(depth=degrade(picture.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))

@@ -24,15 +24,16 @@ class Picture(NamedTuple):
     Args:
         rgb: (H, W, 3) uint8.
         depth: (H, W) float32, metres along the optical axis, 0 above the horizon.
-        labels: (H, W) uint8, 0 where the table or nothing is seen, else the body's place in the order of loading.
+        labels: (H, W) uint8, 0 where the table or nothing is seen, else the body's place in the order of loading; None
+            unless they were asked for.
     """
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
-    labels: NDArray[np.uint8]
+    labels: NDArray[np.uint8] | None
 
 
-def render(client: Any, camera: Camera) -> Picture:
+def render(client: Any, camera: Camera, labelled: bool = False) -> Picture:
     """Render a scene that stands on the table z = 0.
 
     Bodies are drawn by PyBullet's software renderer; the table is computed per pixel, which is exact and costs a third
@@ -41,6 +42,7 @@ def render(client: Any, camera: Camera) -> Picture:
     Args:
         client: PyBullet client whose ground body is invisible.
         camera: where to look from.
+        labelled: whether to tell the bodies apart, which takes a tenth longer.
     """
     near, far = NEAR, FAR
     distance = float(np.linalg.norm(camera.position - SCENE))
@@ -53,20 +55,23 @@ def render(client: Any, camera: Camera) -> Picture:
         _column_major(_projection_matrix(camera, near, far)),
         shadow=0,
         renderer=pybullet.ER_TINY_RENDERER,
+        flags=0 if labelled else pybullet.ER_NO_SEGMENTATION_MASK,
     )
     table_rgb, table_depth = _table(camera)
     rgb, depth = table_rgb.copy(), table_depth.copy()
-    body = np.asarray(mask).ravel()
-    drawn = np.flatnonzero(body >= 0)  # few pixels: the rest is not touched
-    drawn_depth = far * near / (far - (far - near) * np.asarray(zbuffer).ravel()[drawn].astype(np.float64))
+    buffer = np.asarray(zbuffer).ravel()
+    drawn = np.flatnonzero(buffer < 1)  # few pixels: the rest is not touched
+    drawn_depth = far * near / (far - (far - near) * buffer[drawn].astype(np.float64))
     behind = depth.ravel()[drawn]
     nearer = (drawn_depth < behind) | (behind == 0)
     drawn, drawn_depth = drawn[nearer], drawn_depth[nearer]
     rgb.reshape(-1, 3)[drawn] = np.reshape(rgba, (-1, 4))[drawn, :3]
     depth.ravel()[drawn] = drawn_depth
+    if not labelled:
+        return Picture(rgb, depth, None)
     labels = np.zeros(depth.shape, dtype=np.uint8)
     loaded = [client.getBodyUniqueId(index) for index in range(client.getNumBodies())]
-    labels.ravel()[drawn] = np.searchsorted(loaded, body[drawn])
+    labels.ravel()[drawn] = np.searchsorted(loaded, np.asarray(mask).ravel()[drawn])
     return Picture(rgb, depth, labels)
 
 

@@ -45,11 +45,12 @@ ROBOTS = {
         model="franka_panda/panda.urdf",
         base=(-0.1, 0.0, 0.0),
         home=(0.0, 0.1, 0.0, -2.2, 0.0, 2.3, 0.785),
-        hand_link=11,
-        finger_links=((9,), (10,)),
-        gripper_joints=dict.fromkeys((9, 10), (0.0, 0.04, 10.0)),
-        finger_yaw=np.pi / 2,
+        hand_link=6,  # with the hand, which is fixed to it
+        finger_links=((7,), (8,)),
+        gripper_joints=dict.fromkeys((7, 8), (0.0, 0.04, 10.0)),
+        finger_yaw=np.pi / 4,
         arm_force=240.0,
+        hand_from_tool=(0.0, 0.0, 0.212),
     ),
     "kuka": RobotSpec(
         model="kuka_iiwa/kuka_with_gripper2.sdf",

@@ -7,7 +7,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,23 +105,21 @@ def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
     """
     env = config.env.make()
     client, arm = env.scene.client, env.scene.arm
-    parts = {name: Clock(client, function) for name, function in TIMED.items()}
-    resets, steps = [], []
-    spent: dict[str, list[float]] = {name: [] for name in parts}
     start = time.perf_counter()
-    for seed in tqdm(range(config.episodes), desc=config.env.task, unit="episode"):
-        resets.append(_milliseconds(env.reset, seed=seed))
-        done = False
-        while not done:
-            action = env.expert_action()
-            before = {name: part.milliseconds for name, part in parts.items()}
-            begin = time.perf_counter()
-            _, _, terminated, truncated, _ = env.step(action)
-            steps.append(1000 * (time.perf_counter() - begin))
-            for name, part in parts.items():
-                spent[name].append(part.milliseconds - before[name])
-            done = terminated or truncated
+    episodes = [
+        list(_durations(env, seed)) for seed in tqdm(range(config.episodes), desc=config.env.task, unit="episode")
+    ]
     simulated = config.episodes / (time.perf_counter() - start)
+    step = statistics.median(milliseconds for _, *steps in episodes for milliseconds in steps)
+    parts = {name: Clock(client, function) for name, function in TIMED.items()}  # which take time themselves
+    spent: dict[str, list[float]] = {name: [] for name in parts}
+    for seed in range(config.episodes):
+        passed: dict[str, float] = {}
+        for _ in _durations(env, seed):
+            for name, part in parts.items():
+                if name in passed:  # after a step, not after the reset
+                    spent[name].append(part.milliseconds - passed[name])
+                passed[name] = part.milliseconds
     env.reset(seed=0)
     before_free = parts["physics_ms"].milliseconds
     for _ in range(REPEATS):
@@ -129,13 +127,12 @@ def benchmark_env(config: EnvBenchmark) -> dict[str, float]:
     free = (parts["physics_ms"].milliseconds - before_free) / REPEATS
     env.close()
     costs = {name: statistics.median(values) for name, values in spent.items()}
-    step = statistics.median(steps)
     return {
         "step_ms": step,
         **costs,
         "other_ms": step - sum(costs.values()),
         "floor_ms": free + costs["render_ms"],
-        "reset_ms": statistics.median(resets),
+        "reset_ms": statistics.median(reset for reset, *_ in episodes),
         "episodes_per_s": simulated,
         "saved_episodes_per_s": _saved_per_second(config),
     }
@@ -158,6 +155,18 @@ def _expert_episode(env: Any) -> tuple[bool, int]:
         _, _, terminated, truncated, info = env.step(env.expert_action())
         length, done = length + 1, terminated or truncated
     return info["is_success"], length
+
+
+def _durations(env: Any, seed: int) -> Iterator[float]:
+    """Yield the milliseconds that the reset of an expert's episode takes, then those of every step."""
+    yield _milliseconds(env.reset, seed=seed)
+    done = False
+    while not done:
+        action = env.expert_action()
+        start = time.perf_counter()
+        _, _, terminated, truncated, _ = env.step(action)
+        yield 1000 * (time.perf_counter() - start)
+        done = terminated or truncated
 
 
 def _milliseconds(call: Callable[..., Any], *arguments: Any, **options: Any) -> float:

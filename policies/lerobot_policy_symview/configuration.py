@@ -23,7 +23,6 @@ ENCODER_NAMES = ("equivariant", "plain", "relaxed", "voxel", "point_cloud")
 LIFTING = ("voxel", "point_cloud")  # encoders that see the camera's image as points in space
 CROP_SIZES = (64, 128)  # every pooling halves an even size, which keeps D4 exact; the last 8 px become 6, 3, 1
 CHOICES: dict[str, tuple[Any, ...]] = {
-    "view": (*CAMERA_IMAGES, *VIEWS),
     "modality": ("rgb", "rgbd"),
     "encoder": ENCODER_NAMES,
     "group": GROUP_NAMES,
@@ -113,7 +112,7 @@ class SymviewConfig(PreTrainedConfig):
         for name, value in preset.items():
             if getattr(self, name) is None:
                 setattr(self, name, value)
-        for name, choices in CHOICES.items():
+        for name, choices in (CHOICES | {"view": (*CAMERA_IMAGES, *VIEWS)}).items():
             self._check_choice(name, choices)
         if not 16 <= self.width <= 1024 or self.width % 16:
             raise ValueError(f"--policy.width must be a multiple of 16 up to 1024, got {self.width}")

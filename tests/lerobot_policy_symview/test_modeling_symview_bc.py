@@ -12,6 +12,7 @@ from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
+from lerobot_symview.views import VIEWS, ReprojectedView
 from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch
 
 
@@ -205,3 +206,10 @@ def test_the_configuration_offers_what_the_networks_have():
         SymviewBcPolicy(make_config(crop_size=crop_size))
     for preset in METHODS.values():
         assert all(value in CHOICES[name] for name, value in preset.items() if name in CHOICES)
+
+
+def test_a_view_that_is_registered_later_is_a_choice_too(monkeypatch):
+    monkeypatch.setitem(VIEWS, "other", ReprojectedView)
+    assert make_config(view="other", modality="rgb").computed_views.keys() == {"other"}
+    with pytest.raises(ValueError, match="did you mean 'other'"):
+        make_config(view="othr", modality="rgb")

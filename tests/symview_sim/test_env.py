@@ -97,6 +97,15 @@ def test_segmentation_labels_table_robot_and_objects():
         assert set(np.unique(pixels["top_segmentation"])) == {0, 2}
 
 
+def test_labels_change_nothing_else():
+    """Without them the renderer does less, and what is drawn is told by its depth."""
+    plain, labelled = (SymviewEnv("block_in_bowl", cameras=(SIDE,), segmentation=chosen) for chosen in (False, True))
+    for seed in range(2):
+        seen, too = (env.reset(seed=seed)[0] for env in (plain, labelled))
+        np.testing.assert_array_equal(seen["pixels"]["side"], too["pixels"]["side"])
+        np.testing.assert_array_equal(seen["images.side_depth"], too["images.side_depth"])
+
+
 def test_noise_is_in_the_depth_alone_and_new_in_every_frame():
     exact, noisy = SymviewEnv("block_picking", cameras=(SIDE,)), SymviewEnv("block_picking", cameras=(NOISY,))
     still = np.array([0, 0, 0, 0, 1], dtype=np.float32)

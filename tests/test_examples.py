@@ -1,0 +1,167 @@
+"""Every example, run as a user runs it, at a size of seconds. A new one is tested by existing."""
+
+import ast
+import logging
+import re
+import runpy
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+
+from lerobot_symview import names
+from lerobot_symview.views import VIEWS
+from symview_sim.env import SymviewEnv
+from tests.hub.client import online
+from tests.hub.server import ALICE, HubServer
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+LONGEST = 60  # lines
+ONLINE = ("push_to_the_hub",)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How an example is tried, and what must come of it."""
+
+    arguments: str
+    """Its command line, with the folders `recorded`, `with_views` and `output`."""
+    tells: tuple[str, ...]
+    """Regular expressions of lines that it says."""
+    leaves: tuple[str, ...] = ()
+    """Files in `output`."""
+
+
+TRIALS = {
+    "add_views": Trial(
+        "--dataset={recorded} --size=40 --output_dir={output}",
+        (r"side_reproj +\(3, 40, 40\)", r"side_reproj_height +\(1, 40, 40\)", r"side_persp +\(3, 40, 40\)"),
+        ("views.png", "picking_views/meta/symview_views.json"),
+    ),
+    "own_camera": Trial(
+        "--output_dir={output}",
+        (
+            r"7 frames with .*front, .*front_depth, .*front_persp, .*front_reproj, .*front_reproj_height$",
+            r"camera is at \(0\.93, 0\.00, 0\.64\) m",
+        ),
+        ("real/meta/info.json", "real_views/meta/symview_views.json"),
+    ),
+    "own_encoder": Trial("--width=16", (r"moved: errors up to \de-0[67]$", r"plain: errors up to \de[+-]0[01]$")),
+    "own_robot": Trial(
+        "--width=16",
+        (
+            "declared rightly: equivariant",
+            r"wrongly, turned by 90 degrees: \de-0[5-7]$",
+            r"wrongly, mirrored, turned by 0 degrees: \de[+-]0[01]$",
+        ),
+    ),
+    "own_task": Trial("--episodes=3", ("3 demonstrations in 3 attempts",)),
+    "own_view": Trial(
+        "--size=40 --output_dir={output}",
+        (r"7 images \(3, 40, 40\) by ReliefView\(size=40, highest=0\.1\)",),
+        ("relief/meta/symview_views.json",),
+    ),
+    "push_to_the_hub": Trial(
+        "--repo_id=alice/example --episodes=1 --output_dir={output}",
+        ("pulled 1 episodes of alice/example$", "pulled .*side_reproj_height of alice/example_views$"),
+        ("recorded/README.md", "views/README.md"),
+    ),
+    "record_demonstrations": Trial(
+        "--task=block_pushing --azimuth_deg=90 --episodes=2 --output_dir={output}/new",
+        (
+            r"2 episodes, \d+ frames: Push the red block onto the blue square\.",
+            r"observation\.images\.front_depth +image +\(120, 160, 1\)",
+            r"camera is at \(0\.\d+, 0\.6\d, 0\.52\) m",
+        ),
+        ("new/meta/symview_recording.json",),
+    ),
+    "reinforcement_learning": Trial(
+        "--demonstrations=5 --steps=1 --simulators=1 --episodes=1 --output_dir={output}",
+        ("^step,success,return$", r"^1,[01]\.0,", r"the policy is in .*000001/pretrained_model$"),
+        ("sacfd/checkpoints/last/pretrained_model/model.safetensors", "sacfd/training.csv"),
+    ),
+    "stock_policy_on_views": Trial(
+        "--demonstrations=1 --steps=1 --episodes=1 --output_dir={output}",
+        (r"ACT succeeds in \d+ % of 1 episodes",),
+        ("act/checkpoints/last/pretrained_model/model.safetensors", "evaluation/eval_info.json"),
+    ),
+    "train_and_evaluate": Trial(
+        "--dataset={with_views} --steps=1 --episodes=1 --output_dir={output}",
+        ("[01] of 1 episodes succeed",),
+        ("policy/checkpoints/last/pretrained_model/model.safetensors",),
+    ),
+    "view_of_one_image": Trial(
+        "--seed=3 --elevation_deg=50 --picture={output}/views.png",
+        (r"the block is at x = 0\.\d+ m, y = -?0\.\d+ m",),
+        ("views.png",),
+    ),
+}
+
+
+@pytest.fixture
+def without_trace():
+    """Forget the names that an example registers, and what it and LeRobot's training make of the root logger."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    with mock.patch.dict(VIEWS):
+        yield
+    names.added.cache_clear()
+    root.handlers[:], root.level = handlers, level
+
+
+@pytest.fixture
+def run(recorded, with_views, tmp_path, monkeypatch, caplog, without_trace):
+    """Return a function that runs an example and returns what it says."""
+
+    def run(name, arguments):
+        given = arguments.format(recorded=recorded, with_views=with_views, output=tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *given.split()])
+        caplog.set_level(logging.INFO, "__main__")
+        own = logging.getLogger("__main__")
+        own.addHandler(caplog.handler)  # which the example takes from the root
+        try:
+            runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        finally:
+            own.removeHandler(caplog.handler)
+        return "\n".join(dict.fromkeys(record.getMessage() for record in caplog.records if record.name == "__main__"))
+
+    return run
+
+
+def test_every_example_is_tried():
+    assert set(NAMES) == set(TRIALS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_example_is_short_and_says_how_to_run_it(name):
+    text = (EXAMPLES / f"{name}.py").read_text()
+    assert len(text.splitlines()) <= LONGEST
+    assert text.startswith('"""')
+    assert f"\n    python examples/{name}.py" in ast.get_docstring(ast.parse(text))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_example_does_what_it_says(name, run, tmp_path):
+    trial = TRIALS[name]
+    with ExitStack() as stack:
+        if name in ONLINE:
+            stack.enter_context(online(stack.enter_context(HubServer()), ALICE))
+        said = run(name, trial.arguments)
+    for pattern in trial.tells:
+        assert re.search(pattern, said, re.MULTILINE), said
+    for file in trial.leaves:
+        assert (tmp_path / file).stat().st_size > 0
+
+
+def test_the_block_is_found_where_it_lies(run):
+    env = SymviewEnv("block_picking")
+    env.reset(seed=5)
+    lies = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
+    env.close()
+    found = re.search(r"x = (\S+) m, y = (\S+) m", run("view_of_one_image", "--seed=5 --picture={output}/views.png"))
+    np.testing.assert_allclose([float(number) for number in found.groups()], lies, atol=0.005)
