@@ -66,7 +66,7 @@ class AddViewsConfig:
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
     calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/views.md."""
+    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
     keep: list[str] | None = None
     """Source image keys to keep, without `observation.images.`; by default all. `[]` leaves the views alone."""
     num_workers: int = 1

@@ -58,7 +58,7 @@ class PreviewConfig:
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
     calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/views.md."""
+    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
     max_holes: float = 0.5
     """Share of a reprojected view's pixels that may be inferred without a warning."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
