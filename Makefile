@@ -10,7 +10,7 @@ demo: $(READY) ## demonstrations, views, training, evaluation and a report in ou
 	@.venv/bin/symview-demo $(ARGS)
 
 test: $(READY) lint ## every test, slow ones included; `make test ARGS='-m "not slow"'` leaves those out
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadgroup $(ARGS)
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

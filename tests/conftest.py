@@ -39,8 +39,8 @@ EPISODES = 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the slowest tests and those that stay together, so that processes that share the rest end together."""
-    items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("slow", "xdist_group")])
+    """Begin with the slowest files, so that processes that share the rest end together."""
+    items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("slow", "long")])
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ from symview_sim.env import SymviewEnv
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 
+pytestmark = pytest.mark.long
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 LONGEST = 60  # lines

@@ -14,7 +14,7 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from symview_eval.demo import DemoConfig, demo
 from symview_eval.report import read_losses, read_success
 
-pytestmark = pytest.mark.xdist_group("demo")  # one process makes what they share
+pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent
 COMMANDS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
 

@@ -15,6 +15,8 @@ from tests.hostile.files import change_feature
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 
+pytestmark = pytest.mark.long
+
 PROSE = ("index.md", "reference.md")  # lists of other pages
 
 

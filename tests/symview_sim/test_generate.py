@@ -23,6 +23,8 @@ from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import EPISODES, largest_file
 
+pytestmark = pytest.mark.long
+
 SMALL = RecordedEnv(camera=CameraSpec(height=32, width=32), oracle=False)
 COMMAND = Path(sys.executable).parent / "symview-generate"
 

@@ -17,6 +17,8 @@ from lerobot_symview import keys
 from tests.lerobot_policy_symview.policies import make_actor, training_batch
 from tests.lerobot_policy_symview.test_equivariance import EQUIVARIANT
 
+pytestmark = pytest.mark.long
+
 BATCH = 6
 
 

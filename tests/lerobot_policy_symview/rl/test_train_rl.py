@@ -30,7 +30,7 @@ from lerobot_symview.placement import CameraSpec
 from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.lerobot_policy_symview.test_training import train
 
-pytestmark = pytest.mark.xdist_group("train_rl")  # one process makes what they share
+pytestmark = pytest.mark.long
 
 
 def make_config(recorded, folder, **options):

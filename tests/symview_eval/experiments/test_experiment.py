@@ -18,7 +18,7 @@ from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
 from symview_eval.experiments.summary import entries
 
-pytestmark = pytest.mark.xdist_group("table1")  # one process makes what they share
+pytestmark = pytest.mark.long
 
 
 def config(folder, **chosen):
