@@ -13,6 +13,7 @@ from lerobot_symview.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.lerobot_policy_symview.test_training import train
+from tests.packages import install
 
 MODULE = """
     from dataclasses import dataclass
@@ -52,27 +53,19 @@ MODULE = """
             features = self.linear(torch.cat([picture.mean(dim=(2, 3)), state], dim=1))
             return features[:, None].expand(-1, self.group.size, -1)
 """
-ENTRY_POINTS = """
-    [symview.tasks]
-    easy_picking = other_package:EasyPicking
-    [symview.views]
-    grey = other_package:GreyView
-    [symview.encoders]
-    mean = other_package:MeanEncoder
-"""
+ENTRY_POINTS = {
+    "symview.tasks": {"easy_picking": "other_package:EasyPicking"},
+    "symview.views": {"grey": "other_package:GreyView"},
+    "symview.encoders": {"mean": "other_package:MeanEncoder"},
+}
 
 
 @pytest.fixture
 def other_package(tmp_path, monkeypatch):
-    """Install a package the way pip does, for as long as the test runs."""
+    """Install a package for as long as the test runs."""
     site = tmp_path / "site"
-    facts = site / "other_package-1.0.dist-info"
-    facts.mkdir(parents=True)
+    install(site, "other_package", ENTRY_POINTS, monkeypatch)
     (site / "other_package.py").write_text(dedent(MODULE))
-    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: other-package\nVersion: 1.0\n")
-    (facts / "entry_points.txt").write_text(dedent(ENTRY_POINTS))
-    monkeypatch.syspath_prepend(str(site))
-    names.added.cache_clear()
     yield
     names.added.cache_clear()
     sys.modules.pop("other_package", None)

@@ -11,12 +11,12 @@ from pathlib import Path
 from accelerate.state import AcceleratorState
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_symview import names
+from tests.packages import install
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 README = ROOT / "README.md"
-SHELL_ONLY = {"make", "source", "python", "python3.12", "hf", "rerun", "ray", "mkdocs", "scp", "uv"}
+SHELL_ONLY = {"make", "source", "python", "python3.12"}
 """Programs that are neither ours nor LeRobot's, or set up what a test has already."""
 TRAINING = {"--steps": 2, "--batch_size": 2, "--policy.device": "cpu"}
 NETWORK = {"--policy.width": 16, "--policy.crop_size": 64}
@@ -121,13 +121,4 @@ class Reader:
     def _install(self, project: Path) -> None:
         """Have a project's package and entry points found, as an editable installation does."""
         facts = tomllib.loads((project / "pyproject.toml").read_text())["project"]
-        folder = project / f"{facts['name']}-{facts['version']}.dist-info"
-        folder.mkdir()
-        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {facts['name']}\nVersion: {facts['version']}\n")
-        groups = facts["entry-points"].items()
-        lines = [
-            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in added.items()) for group, added in groups
-        ]
-        (folder / "entry_points.txt").write_text("".join(lines))
-        self._monkeypatch.syspath_prepend(str(project.resolve()))
-        names.added.cache_clear()
+        install(project, facts["name"], facts["entry-points"], self._monkeypatch)

@@ -1,6 +1,5 @@
 """The documentation as a browser shows it."""
 
-import os
 import shutil
 import subprocess
 import sys
@@ -53,10 +52,9 @@ def address(site):
 @pytest.fixture(scope="module")
 def tab():
     """A page of a browser."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        assert "CI" not in os.environ, "no Chromium on this machine, and .ci/run should have installed it"
-        pytest.skip("no Chromium on this machine")
+    browser = next(
+        filter(None, map(shutil.which, BROWSERS)), None
+    )  # else Playwright's own
     with sync_playwright() as play:
         window = play.chromium.launch(executable_path=browser, args=QUIET)
         yield window.new_page()
