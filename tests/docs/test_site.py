@@ -52,9 +52,7 @@ def address(site):
 @pytest.fixture(scope="module")
 def tab():
     """A page of a browser."""
-    browser = next(
-        filter(None, map(shutil.which, BROWSERS)), None
-    )  # else Playwright's own
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)  # else Playwright's own
     with sync_playwright() as play:
         window = play.chromium.launch(executable_path=browser, args=QUIET)
         yield window.new_page()
