@@ -104,7 +104,7 @@ def _write(config: AddViewsConfig) -> Path:
     source, target = SourceDataset(config.dataset.folder()), config.target().folder()
     with EXECUTORS["local"](config.num_workers, "lerobot_symview.derivation") as executor:
         derivation = _plan(config, source, partial_folder(target))
-        description = _description(config, derivation, source)
+        description = _description(config, derivation)
         if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
             logger.info("%s is complete already", target)
             return target
@@ -141,8 +141,18 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         for key, feature in source.features.items()
         if feature["dtype"] in ("image", "video") and kept is not None and key not in kept
     ]
-    schema = derived_schema(source, dropped, added)
-    derivation = Derivation(source.folder, folder, config.camera, views, workspace, calibration, dropped, added, schema)
+    derivation = Derivation(
+        source.folder,
+        source_fingerprint(source),
+        folder,
+        config.camera,
+        views,
+        workspace,
+        calibration,
+        dropped,
+        added,
+        derived_schema(source, dropped, added),
+    )
     derivation.reader(source).check()
     _check_names(config, source.features, added)
     return derivation
@@ -174,13 +184,13 @@ def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
             logger.warning("%s", error)
 
 
-def _description(config: AddViewsConfig, derivation: Derivation, source: SourceDataset) -> dict[str, Any]:
+def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, Any]:
     """What determines the result."""
     return plain(
         {
             "repo_id": config.target().repo_id,
             "source": config.dataset.repo_id,
-            "source_files": source_fingerprint(source),
+            "source_files": derivation.source_files,
             "camera": config.camera,
             "views": {name: asdict(view) for name, view in derivation.views.items()},
             "workspace": asdict(derivation.workspace),

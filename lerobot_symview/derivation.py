@@ -14,6 +14,7 @@ import hashlib
 import json
 import shutil
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,6 +42,8 @@ class Derivation:
 
     source: Path
     """Folder of the dataset that is read."""
+    source_files: str
+    """Its fingerprint when the work began."""
     folder: Path
     """`<target>.partial`."""
     camera: str
@@ -62,6 +65,10 @@ class Derivation:
     def dataset(self) -> Path:
         """Where the result grows."""
         return self.folder / "dataset"
+
+    def open_source(self) -> SourceDataset:
+        """Return the dataset that is read, whose metadata a process reads once."""
+        return _opened(self.source, self.source_files)
 
     def reader(self, source: SourceDataset) -> FrameReader:
         """Return what puts the frames of `source` together."""
@@ -90,6 +97,11 @@ class Derivation:
     def statistics_file(self, part: int) -> Path:
         """Where the statistics of a part's new images are."""
         return self.folder / "statistics" / f"{part:06d}.npz"
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path, _fingerprint: str) -> SourceDataset:
+    return SourceDataset(folder)
 
 
 def cut_parts(source: SourceDataset) -> list[range]:
@@ -123,7 +135,7 @@ def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -
 def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     """Write the table and the statistics of a part's episodes, unless they are there; return how many frames."""
     index, episodes = part
-    source = SourceDataset(derivation.source)
+    source = derivation.open_source()
     count = sum(source.episodes[episode]["length"] for episode in episodes)
     table_file, statistics_file = derivation.table_file(source, index), derivation.statistics_file(index)
     if table_file.exists():
@@ -204,7 +216,7 @@ def _packed(merged: dict[str, ImageStatistics]) -> dict[str, Any]:
 
 def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> Path:
     """Complete the result, whose tables are all there, by videos and metadata, and return its folder."""
-    source = SourceDataset(derivation.source)
+    source = derivation.open_source()
     with disk_errors(derivation.folder):
         for key, feature in source.features.items():
             if feature["dtype"] == "video" and key not in derivation.dropped:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: what lies outside counts, for quantiles, as lying at the border
+PER_METRE = round(1 / STEP)
 LEVELS = LOWEST + STEP * np.arange(round((HIGHEST - LOWEST) / STEP) + 1)
 
 
@@ -71,8 +72,8 @@ class ImageStatistics:
             mean = self.sums[:, 2] / total
             variance = self.sums[:, 3] / total - mean**2
         values = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(np.maximum(variance, 0.0))}
-        shares = np.array(list(QUANTILES.values()))
-        quantiles = np.array([levels[np.searchsorted(c, shares * c[-1])] for c in cumulative])
+        ranks = np.ceil(np.outer(total, list(QUANTILES.values()))).astype(np.int64)
+        quantiles = np.array([levels[np.searchsorted(*one)] for one in zip(cumulative, ranks, strict=True)])
         values |= dict(zip(QUANTILES, quantiles.T, strict=True))
         return {name: value.reshape(-1, 1, 1).tolist() for name, value in values.items()} | {"count": [self.images]}
 
@@ -102,6 +103,6 @@ def _count_metres(image, counts, sums):  # type: ignore[no-untyped-def]
             minimum, maximum = min(minimum, value), max(maximum, value)
             total += value
             squares += value * value
-            level = int((min(max(value, LOWEST), HIGHEST) - LOWEST) / STEP + 0.5)
+            level = int((min(max(value, LOWEST), HIGHEST) - LOWEST) * PER_METRE + 0.5)
             counts[level] += 1
     sums[0], sums[1], sums[2], sums[3] = minimum, maximum, total, squares

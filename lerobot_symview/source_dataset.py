@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pyarrow.compute import struct_field
 
 from lerobot_symview import keys
 from lerobot_symview.calibration import Calibration
@@ -122,10 +123,11 @@ class SourceDataset:
         if feature["dtype"] == "video":
             yield from self._video_frames(key, episode, table["timestamp"].to_numpy())
             return
-        for cell in table[key]:
-            data = cell["bytes"].as_buffer()
+        encoded, paths = (struct_field(table[key], part) for part in ("bytes", "path"))
+        for index, image in enumerate(encoded):
+            data = image.as_buffer()
             if data is None:
-                raise ValueError(f"{key}: expected an image in the table, got none, and the path {cell['path']}")
+                raise ValueError(f"{key}: expected an image in the table, got none, and the path {paths[index]}")
             yield self.decode(key, data)
 
     def decode(self, key: str, data: Buffer) -> NDArray:

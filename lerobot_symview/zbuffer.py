@@ -165,12 +165,12 @@ def _draw_depth(depth, rays, origin, ceiling, first, height, source):  # type: i
 
 @njit(cache=True, nogil=True)
 def _gather(shown, heights, sources, colors, rgb, height):  # type: ignore[no-untyped-def]
-    heights, sources = heights.ravel(), sources.ravel()
-    for i in range(shown.shape[0]):
-        for j in range(shown.shape[1]):
-            cell = shown[i, j]
-            if cell >= 0 and sources[cell] >= 0:
-                height[i, j] = heights[cell]
-                color = colors[sources[cell]]
-                for channel in range(3):
-                    rgb[i, j, channel] = color[channel]
+    shown, heights, sources = shown.ravel(), heights.ravel(), sources.ravel()
+    colors, rgb, height = colors.ravel(), rgb.ravel(), height.ravel()
+    for pixel in range(len(shown)):
+        cell = shown[pixel]
+        if cell >= 0 and sources[cell] >= 0:
+            height[pixel] = heights[cell]
+            color = 3 * sources[cell]
+            for channel in range(3):
+                rgb[3 * pixel + channel] = colors[color + channel]
