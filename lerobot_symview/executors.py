@@ -121,7 +121,9 @@ class RayExecutor:
         except self._ray.exceptions.RayTaskError as error:
             raise error.cause from None
         except self._ray.exceptions.RayError as error:
-            raise CommandError(f"the Ray cluster failed, repeat the command with --resume=true: {error}") from None
+            raise CommandError(
+                f"the Ray cluster failed, repeat the command, with --resume=true if it has that flag: {error}"
+            ) from None
 
     def __enter__(self) -> Self:
         return self

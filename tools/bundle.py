@@ -18,7 +18,7 @@ import sys
 import tarfile
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path, PurePosixPath
@@ -29,10 +29,12 @@ from tqdm import tqdm
 ROOT = Path(__file__).parent.parent
 OURS = "lerobot_policy_symview"
 NEEDLESS = ("cmake", "wandb", "sentry-sdk", "gitpython", "gitdb", "smmap")  # to build, and for --wandb.enable=true
+GPU_LIBRARIES = ("nvidia-", "cuda-", "triton")
 ASSETS = ("franka_panda", "kuka_iiwa", "gripper", "cube.mtl")
 SKIPPED_FOLDERS = {"tests", "test", "testing", "__pycache__", "include", "examples"}
 SKIPPED_SUFFIXES = {".pyi", ".pyc", ".pyx", ".pxd", ".h", ".hpp", ".a", ".lib"}
-KEPT = ("numpy/testing", "scipy/_lib", "pandas/_testing", "accelerate/test_utils")  # imported without testing
+# Imported without testing.
+KEPT = ("numpy/testing", "numpy/_core/tests/_natype.py", "scipy/_lib", "pandas/_testing", "accelerate/test_utils")
 
 
 def closure(requirements: list[str]) -> dict[str, Distribution]:
@@ -53,6 +55,16 @@ def closure(requirements: list[str]) -> dict[str, Distribution]:
         needs = [Requirement(text) for text in found[key[0]].requires or []]
         todo += [need for need in needs if not need.marker or any(need.marker.evaluate({"extra": e}) for e in extras)]
     return found
+
+
+def needed(provided: Sequence[str]) -> dict[str, Distribution]:
+    """Return every distribution but those that are provided, the GPU libraries that PyTorch brings, and the needless.
+
+    PyTorch's small needs go along: another machine may have them in versions that are too old for the rest.
+    """
+    left_out = {_normal(name) for name in (*provided, *NEEDLESS)}
+    found = closure([f"{OURS}[sim]"])
+    return {name: one for name, one in found.items() if name not in left_out and not name.startswith(GPU_LIBRARIES)}
 
 
 def files(installed: Distribution) -> Iterator[tuple[PurePosixPath, Path]]:
@@ -113,12 +125,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="where the bundle goes")
     parser.add_argument("--part-mib", type=int, default=60, help="size of a part, unless one archive alone is larger")
-    parser.add_argument("--provided", nargs="*", default=["torch"], help="what the other machine has, with its needs")
+    parser.add_argument("--provided", nargs="*", default=["torch"], help="what the other machine has")
     arguments = parser.parse_args()
     if arguments.folder.exists():
         parser.error(f"{arguments.folder} exists: remove it or name another folder")
-    provided = closure(arguments.provided).keys() | set(NEEDLESS)
-    wanted = {name: one for name, one in closure([f"{OURS}[sim]"]).items() if name not in provided}
+    wanted = needed(arguments.provided)
     arguments.folder.mkdir(parents=True)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         packed = pool.map(lambda one: archive(one, arguments.folder), wanted.values())

@@ -16,6 +16,8 @@ COMMANDS = {
     "symview-experiment": "symview_eval.experiments.experiment",
     "symview-benchmark": "symview_eval.benchmark",
 }
+MODULES = ", ".join([*COMMANDS.values(), "symview_eval.experiments.cells"])
+CHECK = f"import pybullet, {MODULES}; print(pybullet.isNumpyEnabled())"
 LAUNCHER = """\
 #!{python}
 import sys
@@ -36,7 +38,7 @@ def unpack(archive: Path, target: Path) -> None:
 def main() -> None:
     """Unpack every archive beside this file, in parallel, and write launchers and `activate`."""
     if len(sys.argv) != 2 or sys.version_info[:2] != (3, 12):
-        sys.exit(f"usage: python3.12 unpack.py FOLDER (this is Python {sys.version.split()[0]})")
+        sys.exit(f"usage: python3 unpack.py FOLDER, with Python 3.12 (this is Python {sys.version.split()[0]})")
     target = Path(sys.argv[1]).resolve()
     archives = sorted(Path(__file__).parent.glob("part-*/*.tar.xz"), key=lambda path: -path.stat().st_size)
     with ProcessPoolExecutor() as pool:
@@ -49,10 +51,9 @@ def main() -> None:
     (target / "activate").write_text(
         f'export PYTHONPATH="{target}${{PYTHONPATH:+:$PYTHONPATH}}" PATH="{programs}:$PATH" HF_HUB_OFFLINE=1\n'
     )
-    check = "import torch, pybullet, lerobot, lerobot_policy_symview; print(pybullet.isNumpyEnabled())"
     environment = os.environ | {"PYTHONPATH": str(target)}
     found = subprocess.run(  # noqa: S603
-        [sys.executable, "-c", check], env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", CHECK], env=environment, capture_output=True, text=True, check=False
     )
     if found.stdout.strip() != "1":
         sys.exit(f"unpacked {len(archives)} archives, but they do not work with this Python:\n{found.stderr}")

@@ -52,6 +52,19 @@ def test_the_views_benchmark_names_every_ratio(monkeypatch, capsys):
     assert all(value > 0 for value in results.values())
 
 
+def test_the_experiment_benchmark_says_where_time_goes(monkeypatch, capsys):
+    arguments = ["--scale=smoke", "--method=sideview_nonequi", "--num_workers=1", "--json"]
+    monkeypatch.setattr("sys.argv", ["symview-benchmark", "experiment", *arguments])
+    with pytest.raises(SystemExit) as end:
+        benchmark.main()
+    assert end.value.code == 0
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert 0 < results["useful_core_share"] <= 1
+    assert 0 < results["cell_s"] < 3600 / results["cells_per_hour"]
+    parts = ("preparation", "training", "waiting")
+    assert 0 < sum(results[f"{part}_share"] for part in parts) <= 1
+
+
 def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
     monkeypatch.setattr(
         "sys.argv",

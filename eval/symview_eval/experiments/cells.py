@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import platform
+import shutil
 import time
 import traceback
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,9 +17,11 @@ import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.demonstrations import open_dataset
+from lerobot_policy_symview.rl.checkpoints import last_checkpoint
 from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.train_rl import train_rl
+from lerobot_symview.cli import CommandError
 from lerobot_symview.placement import CameraSpec
 from symview_eval.experiments.cloning import clone
 from symview_eval.experiments.grid import Cell
@@ -64,30 +68,35 @@ class Done:
     """Why there is no result; empty if there is one."""
 
 
-def record(job: Job) -> None:
+def record(job: Job) -> Done:
     """Make a cell's demonstrations, unless they are there already."""
-    cell = job.cell
-    env = RecordedEnv(task=cell.task, camera=CameraSpec(elevation_deg=cell.row.elevation_deg))
-    generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
+    return _attempt(job, _record)
 
 
 def run_cell(job: Job) -> Done:
-    """Train and evaluate a cell's policy; write its results and keep the policy.
-
-    A failure ends this cell only.
-    """
-    start = time.perf_counter()
+    """Train and evaluate a cell's policy; write its results and keep the policy."""
     torch.set_num_threads(1)  # sums of more would differ in their last bits, and with them what is learned
+    return _attempt(job, _run)
+
+
+def _attempt(job: Job, work: Callable[[Job], None]) -> Done:
+    start = time.perf_counter()
     try:
-        _run(job, start)
+        work(job)
     except Exception as error:  # whatever it is, the other cells go on and the user is told
         logger.debug("%s", traceback.format_exc())
         return Done(job.cell, time.perf_counter() - start, f"{type(error).__name__}: {error}")
     return Done(job.cell, time.perf_counter() - start)
 
 
-def _run(job: Job, start: float) -> None:
+def _record(job: Job) -> None:
     cell = job.cell
+    env = RecordedEnv(task=cell.task, camera=CameraSpec(elevation_deg=cell.row.elevation_deg))
+    generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
+
+
+def _run(job: Job) -> None:
+    cell, start = job.cell, time.perf_counter()
     env = EnvSettings(
         task=cell.task,
         camera=CameraSpec(elevation_deg=cell.row.elevation_deg),
@@ -127,8 +136,14 @@ def _reinforce(job: Job, env: EnvSettings) -> list[Checkpoint]:
         seed=cell.seed,
         eval_every=scale.rl_eval_every,
         eval_episodes=scale.eval_episodes,
-        resume=(job.output / "checkpoints" / "last").exists(),
+        resume=True,
     )
+    try:
+        last_checkpoint(config)
+    except CommandError as error:  # none yet, or of other settings
+        logger.info("%s is trained from the beginning: %s", cell, error)
+        shutil.rmtree(job.output, ignore_errors=True)
+        config = replace(config, resume=False)
     train_rl(config)
     return [
         Checkpoint(

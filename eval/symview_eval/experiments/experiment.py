@@ -86,15 +86,18 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
 def _run(cells: Sequence[Cell], config: ExperimentConfig) -> None:
     from symview_eval.experiments.cells import Done, Job, record, run_cell
 
-    failures: list[Done] = []
     results, folder = config.results_dir.resolve(), config.output_dir.resolve()
     with EXECUTORS[config.executor](config.num_workers, "symview_eval.experiments.cells") as executor:
         jobs = [Job(cell, results, folder, config.device) for cell in cells]
         recordings = {job.cell.recording: job for job in jobs}.values()
-        for _ in tqdm(executor.run(record, recordings), desc="demonstrations", total=len(recordings), unit="dataset"):
-            pass
-        with tqdm(desc="cells", total=len(jobs), unit="cell") as bar:
-            for done in executor.run(run_cell, jobs):
+        recorded = tqdm(executor.run(record, recordings), desc="demonstrations", total=len(recordings), unit="dataset")
+        lost = {done.cell.recording: done.failure for done in recorded if done.failure}
+        failures = [Done(job.cell, 0.0, lost[job.cell.recording]) for job in jobs if job.cell.recording in lost]
+        for done in failures:
+            tqdm.write(f"failed: {done.cell}: {done.failure}", file=sys.stderr)
+        possible = [job for job in jobs if job.cell.recording not in lost]
+        with tqdm(desc="cells", total=len(possible), unit="cell") as bar:
+            for done in executor.run(run_cell, possible):
                 if done.failure:
                     failures.append(done)
                     tqdm.write(f"failed: {done.cell}: {done.failure}", file=sys.stderr)

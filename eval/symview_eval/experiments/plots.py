@@ -16,13 +16,14 @@ from symview_eval.experiments.summary import Entry
 OURS, THEIRS = "#1f5fa8", "#c2571a"
 
 
-def plot(experiment: Experiment, found: Sequence[Entry]) -> Figure:
+def plot(experiment: Experiment, scale: str, found: Sequence[Entry]) -> Figure:
     """Return the picture that suits an experiment: learning curves, success by angle, or success by row."""
     if experiment.algorithm == "sacfd":
-        return _curves(found)
-    if experiment.name == "figure7":
-        return _angles(found)
-    return _rows(found)
+        figure = _curves(found)
+    else:
+        figure = _angles(found) if experiment.name == "figure7" else _rows(found)
+    figure.suptitle(f"{experiment.title} ({experiment.name}), scale {scale}", fontsize=10)
+    return figure
 
 
 def _panels(found: Sequence[Entry], height: float) -> tuple[Figure, dict[tuple[str, int], Any]]:
@@ -107,8 +108,8 @@ def _curves(found: Sequence[Entry]) -> Figure:
 
 def _mean_curve(results: Sequence[Result]) -> tuple[list[int], list[float], list[float]]:
     """Return steps, mean returns and standard deviations over seeds, of the steps that all seeds reached."""
-    steps = [point.step for point in results[0].checkpoints]
-    columns = list(zip(*([point.mean_return for point in result.checkpoints] for result in results), strict=True))
+    columns = list(zip(*([point.mean_return for point in result.checkpoints] for result in results), strict=False))
+    steps = [point.step for point in results[0].checkpoints[: len(columns)]]
     return steps, [statistics.fmean(column) for column in columns], [statistics.pstdev(column) for column in columns]
 
 

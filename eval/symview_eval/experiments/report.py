@@ -114,5 +114,5 @@ def _section(experiment: Experiment, scale: str, folder: Path) -> Section:
     found = entries(experiment, scale, folder)
     stale = [entry for entry in found if not is_current(entry, experiment, scale)]
     stream = io.BytesIO()
-    plot(experiment, found).savefig(stream, format="png", dpi=110)
+    plot(experiment, scale, found).savefig(stream, format="png", dpi=110)
     return Section(experiment, SCALES[scale], found, stale, orderings(found), stream.getvalue())

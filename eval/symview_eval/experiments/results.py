@@ -28,6 +28,11 @@ class Checkpoint:
     loss: float
     """Mean since the checkpoint before; nan where it is not known."""
 
+    @property
+    def rate(self) -> float:
+        """Successes per episode."""
+        return self.successes / self.episodes
+
 
 @dataclass(frozen=True)
 class Times:

@@ -14,7 +14,7 @@ from pathlib import Path
 from scipy import stats
 
 from symview_eval.experiments.grid import Experiment, Row, select
-from symview_eval.experiments.results import Result, read_result
+from symview_eval.experiments.results import Checkpoint, Result, read_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.statistics import SuccessRate
 
@@ -23,15 +23,14 @@ LAST = 5  # checkpoints whose mean is told
 
 @dataclass(frozen=True)
 class Estimate:
-    """A success rate over seeds and its 95 % interval, in [0, 1]; the ends are nan where one seed says nothing."""
+    """A success rate over seeds and its 95 % interval, in [0, 1]."""
 
     mean: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        ends = "" if math.isnan(self.low) else f" ({100 * self.low:.0f} to {100 * self.high:.0f})"
-        return f"{100 * self.mean:.1f}{ends}"
+        return f"{100 * self.mean:.1f} ({100 * self.low:.0f} to {100 * self.high:.0f})"
 
 
 @dataclass(frozen=True)
@@ -123,42 +122,32 @@ def paper_values(experiment: str) -> dict[tuple[str, int, str], float]:
 def _entry(
     row: Row, task: str, demonstrations: int, results: tuple[Result, ...], paper: dict[tuple[str, int, str], float]
 ) -> Entry:
-    best = [max(point.successes / point.episodes for point in result.checkpoints) for result in results]
     return Entry(
         row,
         task,
         demonstrations,
         results,
-        _over_seeds(best),
-        _pooled(results, 1),
-        _pooled(results, LAST),
+        _pooled([[max(result.checkpoints, key=lambda point: point.rate)] for result in results]),
+        _pooled([result.checkpoints[-1:] for result in results]),
+        _pooled([result.checkpoints[-LAST:] for result in results]),
         paper.get((task, demonstrations, row.name), math.nan),
     )
 
 
-def _over_seeds(rates: Sequence[float]) -> Estimate:
-    """Return the mean and Student's interval over seeds, within [0, 1]."""
-    mean = statistics.fmean(rates)
-    if len(rates) == 1:
-        return Estimate(mean, math.nan, math.nan)
-    half = float(stats.t.ppf(0.975, len(rates) - 1)) * statistics.stdev(rates) / math.sqrt(len(rates))
-    return Estimate(mean, max(0.0, mean - half), min(1.0, mean + half))
-
-
-def _pooled(results: Sequence[Result], last: int) -> Estimate:
-    """Return the rate over all episodes of the last checkpoints.
+def _pooled(seeds: Sequence[Sequence[Checkpoint]]) -> Estimate:
+    """Return the rate over all episodes of each seed's checkpoints.
 
     The interval is the wider of two: Student's over seeds, which vary as trainings do, and Wilson's over episodes,
     which does not vanish where the seeds happen to agree.
     """
-    points = [result.checkpoints[-last:] for result in results]
-    rates = [sum(one.successes for one in seed) / sum(one.episodes for one in seed) for seed in points]
-    every = [one for seed in points for one in seed]
-    episodes = SuccessRate(sum(one.successes for one in every), sum(one.episodes for one in every))
-    seeds, (low, high) = _over_seeds(rates), episodes.interval
-    if math.isnan(seeds.low):
-        return Estimate(seeds.mean, low, high)
-    return Estimate(seeds.mean, min(seeds.low, low), max(seeds.high, high))
+    rates = [sum(one.successes for one in points) / sum(one.episodes for one in points) for points in seeds]
+    every = [one for points in seeds for one in points]
+    low, high = SuccessRate(sum(one.successes for one in every), sum(one.episodes for one in every)).interval
+    mean = statistics.fmean(rates)
+    if len(rates) > 1:
+        half = float(stats.t.ppf(0.975, len(rates) - 1)) * statistics.stdev(rates) / math.sqrt(len(rates))
+        low, high = min(low, max(0.0, mean - half)), max(high, min(1.0, mean + half))
+    return Estimate(mean, low, high)
 
 
 def measured_scales(experiment: Experiment, folder: Path) -> list[str]:
@@ -168,8 +157,7 @@ def measured_scales(experiment: Experiment, folder: Path) -> list[str]:
 
 def is_current(entry: Entry, experiment: Experiment, scale: str) -> bool:
     """Whether all of an entry's results are of what the experiment is now."""
-    cells = select(
-        experiment, SCALES[scale], [entry.task], [entry.row.name], [entry.demonstrations], range(len(entry.results))
-    )
+    seeds = [result.origin.seed for result in entry.results]
+    cells = select(experiment, SCALES[scale], [entry.task], [entry.row.name], [entry.demonstrations], seeds)
     known = {cell.configuration_hash for cell in cells}
     return all(result.origin.configuration in known for result in entry.results)

@@ -1,6 +1,7 @@
 """The command, whole, at the scale `smoke`."""
 
 import csv
+import dataclasses
 import json
 import shutil
 import sys
@@ -9,13 +10,15 @@ from pathlib import Path
 import pytest
 from lerobot.scripts import lerobot_eval
 
+from lerobot_policy_symview.rl.checkpoints import describe
 from lerobot_symview.cli import CommandError
 from symview_eval.experiments import cells as cells_module
 from symview_eval.experiments import experiment
 from symview_eval.experiments.experiment import ExperimentConfig, run_experiment
-from symview_eval.experiments.grid import EXPERIMENTS
+from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
+from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import entries
 
 pytestmark = pytest.mark.long
@@ -121,6 +124,35 @@ def test_a_cell_that_fails_does_not_keep_others_from_running(tmp_path, monkeypat
     assert done.parts[-3] == "sideview_nonequi"
     with done.open() as stream:
         assert list(csv.DictReader(line for line in stream if not line.startswith("#")))
+
+
+def test_demonstrations_that_cannot_be_made_do_not_keep_others_from_being(tmp_path):
+    chosen = config(tmp_path, tasks=["block_pushing", "block_picking"], methods=["sideview_nonequi"])
+    (tmp_path / "output" / "recordings" / "block_pushing_45deg_1_seed0").mkdir(parents=True)
+    with pytest.raises(CommandError, match=r"1 of 2 cells failed.*sideview_nonequi on block_pushing.*exists"):
+        run_experiment("table1", chosen)
+    (done,) = (tmp_path / "results").rglob("*.csv")
+    assert "block_picking" in done.parts
+
+
+def test_reinforcement_learning_of_other_settings_is_begun_anew(tmp_path, monkeypatch):
+    (cell,) = select(EXPERIMENTS["figure5"], SCALES["smoke"], ["block_picking"], ["sideview_nonequi"])
+    job = cells_module.Job(cell, tmp_path / "results", tmp_path / "output", "cpu")
+    begun = []
+
+    def train(configuration):
+        """Leave what a training does: its flags and an evaluation."""
+        begun.append(configuration.resume)
+        last = job.output / "checkpoints" / "last" / "pretrained_model"
+        last.mkdir(parents=True, exist_ok=True)
+        (last / "train_config.json").write_text(json.dumps(describe(configuration)))
+        (job.output / "evaluation.csv").write_text("step,success,return\n1,1.0,0.5\n")
+
+    monkeypatch.setattr(cells_module, "train_rl", train)
+    longer = dataclasses.replace(cell, scale=dataclasses.replace(cell.scale, rl_steps=3))
+    for asked in (cell, cell, longer):
+        assert cells_module.run_cell(dataclasses.replace(job, cell=asked)).failure == ""
+    assert begun == [False, True, False]
 
 
 def test_cells_run_on_a_ray_cluster(table1, tmp_path):

@@ -18,10 +18,10 @@ from symview_eval.experiments.scale import SCALES
 SCALE = SCALES["laptop"]
 
 
-def result(configuration="0123456789abcdef", successes=(3, 17)):
+def result(configuration="0123456789abcdef", successes=(3, 17), seed=0):
     checkpoints = [Checkpoint(200 * i, count, 20, 0.125 * i, 0.5) for i, count in enumerate(successes, start=1)]
     return Result(
-        Origin(configuration, 0, "0.1.0", "Linux x86_64, 2 cores", 101.5, "cpu"), Times(1.0, 90.0), checkpoints
+        Origin(configuration, seed, "0.1.0", "Linux x86_64, 2 cores", 101.5, "cpu"), Times(1.0, 90.0), checkpoints
     )
 
 

@@ -1,6 +1,7 @@
 import pytest
 
 from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.plots import plot
 from symview_eval.experiments.results import write_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import entries, is_current, measured_scales, orderings
@@ -14,7 +15,7 @@ def write(folder, method, *seeds):
     """A result of 10 demonstrations of block picking for every seed, each a list of successes of 20 episodes."""
     for seed, successes in enumerate(seeds):
         (cell,) = select(TABLE, SCALE, ["block_picking"], [method], [10], [seed])
-        write_result(folder / cell.path, result(cell.configuration_hash, successes))
+        write_result(folder / cell.path, result(cell.configuration_hash, successes, seed))
 
 
 def test_best_last_and_mean_of_the_last_five(tmp_path):
@@ -32,23 +33,22 @@ def test_intervals_over_seeds_and_episodes(tmp_path):
     write(tmp_path, "reproj_equi", [10], [12], [14])
     (entry,) = entries(TABLE, "laptop", tmp_path)
     half = 4.30265 * 0.1 / 3**0.5  # Student's, two degrees of freedom, standard deviation 0.1
-    assert (entry.best.low, entry.best.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
-    assert (entry.last.low, entry.last.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
+    for estimate in (entry.best, entry.last, entry.last_five):
+        assert (estimate.low, estimate.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
 
 
 def test_seeds_that_agree_do_not_make_a_rate_certain(tmp_path):
     write(tmp_path, "reproj_equi", [10], [10], [10])
     (entry,) = entries(TABLE, "laptop", tmp_path)
-    assert entry.best.low == entry.best.high == 0.5
-    assert entry.last.low == pytest.approx(0.3774, abs=1e-3)  # Wilson, 30 of 60
-    assert entry.last.high == pytest.approx(0.6226, abs=1e-3)
+    for estimate in (entry.best, entry.last, entry.last_five):
+        assert (estimate.low, estimate.high) == pytest.approx((0.3774, 0.6226), abs=1e-3)  # Wilson, 30 of 60
 
 
-def test_one_seed_says_nothing_of_the_best(tmp_path):
-    write(tmp_path, "reproj_equi", [10])
+def test_of_one_seed_only_its_episodes_speak(tmp_path):
+    write(tmp_path, "reproj_equi", [10, 4])
     (entry,) = entries(TABLE, "laptop", tmp_path)
-    assert str(entry.best) == "50.0"
-    assert str(entry.last) == "50.0 (30 to 70)"
+    assert str(entry.best) == "50.0 (30 to 70)"
+    assert str(entry.last) == "20.0 (8 to 42)"
 
 
 def test_orders_of_the_paper_are_compared(tmp_path):
@@ -61,6 +61,23 @@ def test_orders_of_the_paper_are_compared(tmp_path):
         ("reproj_equi", "sideview_nonequi", True),
         ("oracle_equi", "sideview_nonequi", True),
     }
+
+
+def test_a_seed_may_be_missing(tmp_path):
+    (cell,) = select(TABLE, SCALE, ["block_picking"], ["reproj_equi"], [10], [1])
+    write_result(tmp_path / cell.path, result(cell.configuration_hash, seed=1))
+    (entry,) = entries(TABLE, "laptop", tmp_path)
+    assert is_current(entry, TABLE, "laptop")
+
+
+def test_curves_end_where_the_shortest_seed_does(tmp_path):
+    figure5 = EXPERIMENTS["figure5"]
+    for seed, successes in enumerate([[1, 2, 3], [1, 2]]):
+        (cell,) = select(figure5, SCALE, ["block_picking"], ["reproj_equi"], (), [seed])
+        write_result(tmp_path / cell.path, result(cell.configuration_hash, successes, seed))
+    figure = plot(figure5, "laptop", entries(figure5, "laptop", tmp_path))
+    assert list(figure.axes[0].lines[0].get_xdata()) == [200, 400]
+    assert "scale laptop" in figure.get_suptitle()
 
 
 def test_results_of_other_settings_are_told_apart(tmp_path):
