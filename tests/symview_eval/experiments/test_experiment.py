@@ -3,6 +3,8 @@
 import csv
 import dataclasses
 import json
+import math
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -196,3 +198,20 @@ def test_the_committed_results_are_what_the_report_is_made_of(tmp_path):
     table = EXPERIMENTS["table1"]
     found = entries(table, "laptop", results)
     assert sum(len(entry.results) for entry in found) == len(list((results / "table1" / "laptop").rglob("*.csv")))
+
+
+def test_the_numbers_of_the_readme_come_from_the_committed_results():
+    """Cells such as `83 (85), mean 60`, of each experiment in the order of its entries there."""
+    readme = re.sub(r"\s+", " ", Path("README.md").read_text())
+    told = set(re.findall(r"\d+(?: \(\d+\))?, mean \d+", readme))
+    known = set()
+    for one in EXPERIMENTS.values():
+        for entry in entries(one, "laptop", Path("results")):
+            paper = "" if math.isnan(entry.paper) else f" ({percent(entry.paper)})"
+            known.add(f"{percent(entry.best.mean)}{paper}, mean {percent(entry.last_five.mean)}")
+    assert len(told) > 20
+    assert told <= known
+
+
+def percent(rate):
+    return math.floor(100 * rate + 0.5 + 1e-9)  # halves upwards, as in the README
