@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -29,7 +28,7 @@ from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, calibration_features, stored_workspace, view_features
 from lerobot_symview.hub import PushedDataset, push_dataset
 from lerobot_symview.source_dataset import EpisodeTables, SourceDataset
-from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain
+from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain, remove_partial
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
 from lerobot_symview.workspace import check_visible
 
@@ -116,7 +115,7 @@ def _write(config: AddViewsConfig) -> Path:
             for frames in executor.run(partial(write_part, derivation), list(enumerate(parts))):
                 bar.update(frames)
     finish(derivation, parts, description).rename(target)
-    shutil.rmtree(derivation.folder)
+    remove_partial(derivation.folder)
     logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
     return target
 

@@ -1,7 +1,10 @@
 """Results appear whole or not at all: they are made in `<target>.partial` and moved to `<target>` in the end.
 
-<target>.partial/request.json     what is made; a command that goes on with it must ask for the same
-<target>.partial/...              finished pieces, each complete or absent
+<target>.partial/request.json         what is made; a command that goes on with it must ask for the same
+<target>.partial/request.json.done    the same, once the result is in its place and the rest is being removed
+<target>.partial/...                  finished pieces, each complete or absent
+
+A folder of that name with neither is somebody else's and stays as it is.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from uuid import uuid4
 from lerobot_symview.cli import CommandError
 
 REQUEST = "request.json"
+DONE = f"{REQUEST}.done"
 
 
 def partial_folder(target: Path) -> Path:
@@ -40,7 +44,9 @@ def is_complete(target: Path, made_from: str, description: dict[str, Any], resum
         return False
     file = target / "meta" / made_from
     if resume and file.exists() and json.loads(file.read_text()) == description:
-        shutil.rmtree(partial_folder(target), ignore_errors=True)
+        folder = partial_folder(target)
+        if (folder / DONE).exists() or _request(folder) == description:
+            remove_partial(folder)
         return True
     raise CommandError(f"{target} exists already: choose another {flag} or remove it")
 
@@ -49,25 +55,61 @@ def open_partial(folder: Path, description: dict[str, Any], resume: bool) -> Non
     """Prepare the folder in which a result is made, or check that the one that is there makes the same result.
 
     Raises:
-        CommandError: if there is one and `resume` was not asked for, or it was begun by another command.
+        CommandError: if there is one and `resume` was not asked for, or it was begun by another command or by none.
     """
-    file = folder / REQUEST
-    if file.exists():
+    found = _request(folder)
+    if found is not None:
         if not resume:
             raise CommandError(f"{folder} was begun and interrupted: add --resume=true to go on, or remove it")
-        found = json.loads(file.read_text())
         different = [key for key in description if found.get(key) != description[key]]
         if different:
             raise CommandError(
                 f"{folder} was begun with another {', '.join(different)}: repeat the command that began it or remove it"
             )
         return
-    if folder.exists():  # what a clean-up that was interrupted left behind
-        shutil.rmtree(folder)
-    folder.mkdir(parents=True)
-    part = part_of(file)
+    if (folder / DONE).exists():
+        remove_partial(folder)
+    _check_nobody_elses(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    part = part_of(folder / REQUEST)
     part.write_text(json.dumps(description))
-    part.replace(file)
+    part.replace(folder / REQUEST)
+
+
+def remove_partial(folder: Path) -> None:
+    """Remove the folder in which a result was made. Interrupted, it is still known as ours, and not gone on with."""
+    if (folder / REQUEST).exists():
+        (folder / REQUEST).replace(folder / DONE)
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != DONE:
+            path.unlink()
+    (folder / DONE).unlink()
+    folder.rmdir()
+
+
+def _request(folder: Path) -> dict[str, Any] | None:
+    """Return what the result in `folder` is to be, None if no command says so there."""
+    try:
+        found = json.loads((folder / REQUEST).read_text())
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _check_nobody_elses(folder: Path) -> None:
+    if not folder.exists():
+        return
+    # A command that was killed at its very beginning leaves an unfinished request.
+    strangers = ["it is a file"]
+    if folder.is_dir():
+        strangers = sorted(path.name for path in folder.iterdir() if not path.match(f"{REQUEST}.*.part"))
+    if strangers:
+        raise CommandError(
+            f"results are made in {folder}, which holds what no command of ours put there "
+            f"({', '.join(strangers[:3])}): move it elsewhere or choose another folder for the result"
+        )
 
 
 def part_of(path: Path) -> Path:

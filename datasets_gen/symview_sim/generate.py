@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import shutil
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -19,7 +18,7 @@ from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, camera_features
 from lerobot_symview.hub import push_dataset
 from lerobot_symview.names import lookup
-from lerobot_symview.staging import is_complete, open_partial, partial_folder
+from lerobot_symview.staging import is_complete, open_partial, partial_folder, remove_partial
 from symview_sim.env import SymviewEnv
 from symview_sim.recording import (
     MADE_FROM,
@@ -118,7 +117,7 @@ def _write(config: GenerateConfig) -> Path:
 
         folders = list(tqdm(written, desc="writing", total=len(shards), unit="shard"))
     join_shards(recording, sorted(folders)).rename(target)
-    shutil.rmtree(recording.folder)
+    remove_partial(recording.folder)
     logger.info("wrote %d demonstrations to %s; the expert succeeded in %.1f %%", done, target, 100 * done / tried)
     return target
 

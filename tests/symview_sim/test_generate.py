@@ -189,7 +189,7 @@ def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tm
 
 def test_what_an_interrupted_clean_up_left_is_not_adopted(small_shards, tmp_path):
     plan = _begun(tmp_path)
-    (plan.folder / "request.json").unlink()
+    (plan.folder / "request.json").rename(plan.folder / "request.json.done")
     folder = generate(config(tmp_path / "data", num_episodes=1, seed=1))
     starts = LeRobotDataset("test/small", root=folder)[0][keys.ACTION].numpy()
     np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0)[0][keys.ACTION][0])
