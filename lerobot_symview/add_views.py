@@ -14,7 +14,7 @@ from tqdm import tqdm
 from lerobot_symview import keys
 from lerobot_symview.calibration import plain_calibration, read_calibration
 from lerobot_symview.camera import CalibrationError
-from lerobot_symview.cli import DatasetTarget, run_command
+from lerobot_symview.cli import DatasetTarget, check_repo_id, run_command
 from lerobot_symview.derivation import (
     MADE_FROM,
     Derivation,
@@ -76,6 +76,8 @@ class AddViewsConfig:
     def __post_init__(self) -> None:
         if self.num_workers < 1:
             raise ValueError(f"--num_workers must be at least 1, got {self.num_workers}")
+        if self.new_repo_id:
+            check_repo_id(self.new_repo_id, "--new_repo_id")
         self.chosen_views()
 
     def chosen_views(self) -> dict[str, View]:

@@ -33,8 +33,7 @@ class DatasetTarget:
     """Folder; by default LeRobot's own cache folder for `repo_id`."""
 
     def __post_init__(self) -> None:
-        if self.repo_id.count("/") != 1 or not all(self.repo_id.split("/")):
-            raise ValueError(f"--dataset.repo_id must look like user/name, got {self.repo_id!r}")
+        check_repo_id(self.repo_id, "--dataset.repo_id")
 
     def folder(self) -> Path:
         """Return the folder, resolved."""
@@ -43,6 +42,12 @@ class DatasetTarget:
         from lerobot.utils.constants import HF_LEROBOT_HOME
 
         return Path(HF_LEROBOT_HOME) / self.repo_id
+
+
+def check_repo_id(repo_id: str, flag: str) -> None:
+    """Raise a ValueError that names `flag`, which states it, unless `repo_id` looks like a name on the Hub."""
+    if repo_id.count("/") != 1 or not all(repo_id.split("/")):
+        raise ValueError(f"{flag} must look like user/name, got {repo_id!r}")
 
 
 def run_command[Config](

@@ -271,3 +271,9 @@ def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
 def test_unknown_views_are_refused_before_anything_is_read(views):
     with pytest.raises(ValueError, match=r"view"):
         AddViewsConfig(PushedDataset("a/b"), views=views)
+
+
+@pytest.mark.parametrize("name", ["views", "me/", "a/b/c"])
+def test_a_wrong_name_of_the_result_names_its_flag(name):
+    with pytest.raises(ValueError, match=f"--new_repo_id must look like user/name, got '{name}'"):
+        AddViewsConfig(PushedDataset("a/b"), new_repo_id=name)
