@@ -103,6 +103,7 @@ def add_views(config: AddViewsConfig) -> Path:
 
 def _write(config: AddViewsConfig) -> Path:
     source, target = SourceDataset(config.dataset.folder()), config.target().folder()
+    _check_apart(source.folder, target)
     with EXECUTORS["local"](config.num_workers, "lerobot_symview.derivation") as executor:
         derivation = _plan(config, source, partial_folder(target))
         description = _description(config, derivation)
@@ -120,6 +121,17 @@ def _write(config: AddViewsConfig) -> Path:
     remove_partial(derivation.folder)
     logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
     return target
+
+
+def _check_apart(source: Path, target: Path) -> None:
+    """Raise a ValueError if what is written would lie in what is read, or the other way round."""
+    source = source.resolve()
+    for written in (target.resolve(), partial_folder(target).resolve()):
+        if written.is_relative_to(source) or source.is_relative_to(written):
+            raise ValueError(
+                f"the result would be written to {written} and the source is in {source}: "
+                "neither may lie in the other, choose another --new_root"
+            )
 
 
 def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:

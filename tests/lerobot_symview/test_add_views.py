@@ -277,3 +277,21 @@ def test_unknown_views_are_refused_before_anything_is_read(views):
 def test_a_wrong_name_of_the_result_names_its_flag(name):
     with pytest.raises(ValueError, match=f"--new_repo_id must look like user/name, got '{name}'"):
         AddViewsConfig(PushedDataset("a/b"), new_repo_id=name)
+
+
+@pytest.mark.parametrize("place", ["source/views", "source/meta/views", "source", ".", "link/views"])
+def test_source_and_result_do_not_lie_in_each_other(recorded, tmp_path, place):
+    source = tmp_path / "source"
+    shutil.copytree(recorded, source)
+    (tmp_path / "link").symlink_to(source)
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="neither may lie in the other, choose another --new_root"):
+        add_views(views_config(source, tmp_path / place))
+    assert contents(tmp_path) == before
+
+
+def test_a_source_is_not_where_the_result_is_made(recorded, tmp_path):
+    source = tmp_path / "views.partial" / "source"
+    shutil.copytree(recorded, source)
+    with pytest.raises(ValueError, match="choose another --new_root"):
+        add_views(views_config(source, tmp_path / "views"))
