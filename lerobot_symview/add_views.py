@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -39,7 +39,8 @@ EXAMPLES = """\
   symview-add-views --dataset.repo_id=me/picking --dataset.root=data/picking \\
       --new_repo_id=me/picking_reproj --new_root=data/picking_reproj --views='[reproj]' --size=76 --keep='[]'
   symview-add-views --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --num_workers=4 \\
-      --reproj.clip=0.15 --reproj.source_scale=2"""
+      --reproj.clip=0.15 --reproj.source_scale=2
+  symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/stock --size=76 --for_stock_policies=true"""
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,10 @@ class AddViewsConfig:
     """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
     keep: list[str] | None = None
     """Source image keys to keep, without `observation.images.`; by default all. `[]` leaves the views alone."""
+    for_stock_policies: bool = False
+    """Only what LeRobot's own policies take: no source image, unless `keep` names it, and no height, which has one
+    channel.
+    """
     num_workers: int = 1
     """Processes that make views side by side. The data does not depend on it."""
     resume: bool = False
@@ -82,7 +87,12 @@ class AddViewsConfig:
 
     def chosen_views(self) -> dict[str, View]:
         """Return the views by name."""
-        return choose_views(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
+        views = choose_views(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
+        return {name: _in_color(name, view) for name, view in views.items()} if self.for_stock_policies else views
+
+    def kept_images(self) -> list[str] | None:
+        """Return the names of the source's images that are kept; None if all are."""
+        return [] if self.keep is None and self.for_stock_policies else self.keep
 
     def target(self) -> DatasetTarget:
         """Return where the result goes."""
@@ -148,11 +158,11 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     stated = plain_calibration(calibration) if calibration is not None else None
     for name, view in views.items():
         added |= view_features(config.camera, name, view, workspace, stated)
-    kept = None if config.keep is None else {keys.rgb(name) for name in config.keep}
+    kept = config.kept_images()
     dropped = [
         key
         for key, feature in source.features.items()
-        if feature["dtype"] in ("image", "video") and kept is not None and key not in kept
+        if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.rgb("")) not in kept
     ]
     derivation = Derivation(
         source.folder,
@@ -212,6 +222,23 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "symview": version("lerobot_policy_symview"),
         }
     )
+
+
+def _in_color(name: str, view: View) -> View:
+    """Return a view without its height, which a policy for images of three channels does not take.
+
+    Raises:
+        ValueError: if the view `name` has one and no option `height` to do without.
+    """
+    if any(option.name == "height" for option in fields(view)):
+        view = replace(view, height=False)
+    single = [output for output, kind in view.outputs.items() if kind == "height"]
+    if single:
+        raise ValueError(
+            f"--for_stock_policies=true takes images of three channels, the view {name!r} has one in "
+            f"{', '.join(single)}: take it out of --views"
+        )
+    return view
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 import json
 import shutil
+import sys
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -7,6 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 from lerobot.datasets import LeRobotDataset, modify_features
+from lerobot.scripts import lerobot_train
 
 from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
@@ -295,3 +298,37 @@ def test_a_source_is_not_where_the_result_is_made(recorded, tmp_path):
     shutil.copytree(recorded, source)
     with pytest.raises(ValueError, match="choose another --new_root"):
         add_views(views_config(source, tmp_path / "views"))
+
+
+def test_lerobots_own_act_trains_on_what_is_made_for_stock_policies(recorded, tmp_path, monkeypatch):
+    source = views_config(recorded, tmp_path / "stock", for_stock_policies=True)
+    dataset = LeRobotDataset("test/stock", root=add_views(source))
+    assert set(dataset.meta.camera_keys) == {keys.view("side", name) for name in ("reproj", "persp", "persp_gripper")}
+    assert set(dataset.meta.stats) == set(dataset.meta.features)
+    made = dataset.meta.features[keys.view("side", "reproj")]["info"]["symview"]
+    assert make_view(made["view"], **made["options"]).outputs == {"reproj": "rgb"}
+    arguments = ["--dataset.repo_id=test/stock", f"--dataset.root={tmp_path / 'stock'}", "--policy.type=act"]
+    arguments += ["--policy.push_to_hub=false", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null"]
+    arguments += ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=4"]
+    arguments += ["--policy.n_action_steps=4", "--steps=2", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments, f"--output_dir={tmp_path / 'act'}"])
+    lerobot_train.main()
+    assert (tmp_path / "act" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_a_camera_may_be_kept_for_stock_policies(recorded, tmp_path):
+    config = views_config(recorded, tmp_path / "stock", for_stock_policies=True, views=["reproj"], keep=["side"])
+    images = LeRobotDataset("test/stock", root=add_views(config)).meta.camera_keys
+    assert set(images) == {keys.rgb("side"), keys.view("side", "reproj")}
+
+
+def test_a_view_of_one_channel_is_refused_for_stock_policies(monkeypatch):
+    @dataclass(frozen=True)
+    class Metres:
+        size: int = 8
+        outputs = {"metres": "height"}  # noqa: RUF012
+
+    monkeypatch.setitem(VIEWS, "metres", Metres)
+    AddViewsConfig(PushedDataset("a/b"), views=["metres"])
+    with pytest.raises(ValueError, match="the view 'metres' has one in metres: take it out of --views"):
+        AddViewsConfig(PushedDataset("a/b"), views=["metres"], for_stock_policies=True)
