@@ -27,7 +27,7 @@ from lerobot_symview.derivation import (
 from lerobot_symview.executors import EXECUTORS
 from lerobot_symview.features import Features, calibration_features, stored_workspace, view_features
 from lerobot_symview.hub import PushedDataset, push_dataset
-from lerobot_symview.source_dataset import EpisodeTables, SourceDataset
+from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
 from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain, remove_partial
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
 from lerobot_symview.workspace import check_visible
@@ -164,7 +164,11 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         for key, feature in source.features.items()
         if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.rgb("")) not in kept
     ]
-    derivation = Derivation(
+    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
+    reader.check()
+    _check_names(config, source.features, added)
+    source.check_files([key for key in source.features if key not in dropped or key in reader.features()])
+    return Derivation(
         source.folder,
         source_fingerprint(source),
         folder,
@@ -176,9 +180,6 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         added,
         derived_schema(source, dropped, added),
     )
-    derivation.reader(source).check()
-    _check_names(config, source.features, added)
-    return derivation
 
 
 def _check_names(config: AddViewsConfig, features: Features, added: Features) -> None:

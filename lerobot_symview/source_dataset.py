@@ -111,6 +111,32 @@ class SourceDataset:
             starts.setdefault(self.data_file(episode), row["dataset_from_index"])
         return starts
 
+    def video_file(self, key: str, episode: int) -> Path:
+        """Where an episode's images of a video feature are.
+
+        Raises:
+            CommandError: if the dataset does not say.
+        """
+        row, template = self.episodes[episode], self.info["video_path"]
+        places = {part: row.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
+        if template is None or None in places.values():
+            raise CommandError(f"{self.folder / 'meta'} does not say in which video episode {episode} of {key} is")
+        return self.folder / template.format(video_key=key, **places)
+
+    def check_files(self, features: Collection[str]) -> None:
+        """Raise a CommandError that names the files which `features` of every episode need and which are not there."""
+        videos = [key for key in features if self.features[key]["dtype"] == "video"]
+        files = {self.folder / "meta" / "stats.json": None}
+        for episode in range(len(self.episodes)):
+            files[self.data_file(episode)] = None
+            files |= dict.fromkeys(self.video_file(key, episode) for key in videos)
+        missing = [str(file.relative_to(self.folder)) for file in files if not file.is_file()]
+        if missing:
+            more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+            raise CommandError(
+                f"the dataset in {self.folder} lacks {', '.join(missing[:3])}{more}: download or copy it again"
+            )
+
     def images(self, key: str, episode: int, table: pa.Table) -> Iterator[NDArray]:
         """Decode an image or video feature: (H, W, 3) uint8, or (H, W) distances, float metres or integer millimetres.
 
@@ -153,8 +179,7 @@ class SourceDataset:
         from lerobot.datasets.video_utils import decode_video_frames
 
         row, info = self.episodes[episode], self.features[key].get("info") or {}
-        place = {part: row[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")}
-        file = self.folder / self.info["video_path"].format(video_key=key, **place)
+        file = self.video_file(key, episode)
         with av.open(str(file)) as container:
             stream = container.streams.video[0]
             self._check_size(key, stream.height, stream.width)
@@ -241,15 +266,19 @@ class FrameReader:
         """Whether the gripper's state is wanted."""
         return any(view.needs_gripper for view in self.views)
 
-    def columns(self) -> list[str]:
-        """Return the columns of the tables that `frames` reads; what is video is not among them."""
-        features = self.dataset.features
+    def features(self) -> list[str]:
+        """Return the features that `frames` reads, whether the dataset has them or not."""
         wanted = [keys.rgb(self.camera), "timestamp"]
         wanted += [keys.depth(self.camera)] if self.depth else []
         wanted += [keys.STATE] if self.gripper else []
         if self.calibration is None:
             wanted += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
-        return [key for key in wanted if features.get(key, {}).get("dtype") != "video"]
+        return wanted
+
+    def columns(self) -> list[str]:
+        """Return the columns of the tables that `frames` reads; what is video is not among them."""
+        features = self.dataset.features
+        return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
 
     def check(self) -> None:
         """Raise a ValueError that names what is wanted and not in the dataset, and what can be done."""

@@ -144,9 +144,16 @@ def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
     key = keys.view("side", "reproj_height")
     difference = np.abs(images_of(folders[True], key) - images_of(folders[False], key))
     assert (difference > 3e-4).mean() < 0.02
-    only = add_views(views_config(tmp_path / "source-True", tmp_path / "only", keep=[]))
+    source = tmp_path / "source-True"
+    only = add_views(views_config(source, tmp_path / "only", keep=[]))
     assert not (only / "videos").exists()
     np.testing.assert_array_equal(images_of(only, key), images_of(folders[True], key))
+    lost = next((source / "videos" / keys.depth("side")).rglob("*.mp4"))
+    lost.unlink()
+    with pytest.raises(CommandError, match=rf"lacks videos/{keys.depth('side')}/.*file-000\.mp4: download or copy"):
+        add_views(views_config(source, tmp_path / "never"))
+    assert not (tmp_path / "never.partial").exists()
+    add_views(views_config(source, tmp_path / "without_depth", views=["persp"], keep=[]))  # which that video is not for
 
 
 def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
@@ -332,3 +339,13 @@ def test_a_view_of_one_channel_is_refused_for_stock_policies(monkeypatch):
     AddViewsConfig(PushedDataset("a/b"), views=["metres"])
     with pytest.raises(ValueError, match="the view 'metres' has one in metres: take it out of --views"):
         AddViewsConfig(PushedDataset("a/b"), views=["metres"], for_stock_policies=True)
+
+
+@pytest.mark.parametrize("file", ["meta/stats.json", "data/chunk-000/file-000.parquet"])
+def test_a_file_that_the_source_lacks_is_named_before_any_work(recorded, tmp_path, file):
+    source = tmp_path / "source"
+    shutil.copytree(recorded, source)
+    (source / file).unlink()
+    with pytest.raises(CommandError, match=rf"dataset in .* lacks {file}: download or copy it again"):
+        add_views(views_config(source, tmp_path / "never"))
+    assert list(tmp_path.iterdir()) == [source]
