@@ -15,8 +15,8 @@ from lerobot_symview import keys
 from lerobot_symview.calibration import read_calibration
 from lerobot_symview.camera import Camera, project
 from lerobot_symview.cli import CommandError, DatasetTarget, run_command
-from lerobot_symview.features import stored_workspace
-from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.features import Features, stored_workspace
+from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, choose_views
 from lerobot_symview.workspace import MINIMUM_VISIBLE, Workspace
 from symview_eval.contact_sheet import Row, grey, montage, page, with_outline
@@ -50,7 +50,9 @@ class PreviewConfig:
     camera: str = "side"
     """Camera that views are made from; a dataset that holds only views is shown as it is."""
     views: list[str] | None = None
-    """Which views; by default all the dataset has the images for."""
+    """Which views to compute; by default those that the dataset does not store and has the images for, and those whose
+    options are stated. Stored ones are shown as they are.
+    """
     size: int | None = None
     """Rows and columns of all views, in place of each one's own."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
@@ -141,7 +143,8 @@ def preview(config: PreviewConfig) -> Path:
             rows.append(_row(config.camera, moment, moment.frame, made, measures))
             measured.append(measures)
             if recording is not None:
-                recording.add(len(rows) - 1, config.camera, moment.frame, made)
+                stored = {name: moment.stored[name] for name in _stored_views(source.features)}
+                recording.add(len(rows) - 1, config.camera, moment.frame, stored | made)
     if recording is not None:
         recording.close()
     warnings = _warnings(config, views, reader.workspace, measured) if reader is not None else []
@@ -162,13 +165,29 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
     calibration = read_calibration(config.calibration) if config.calibration else None
     stated = calibration.workspace if calibration is not None else None
     options: dict[str, View] = {"reproj": config.reproj, "persp": config.persp}
-    has_depth = keys.depth(config.camera) in source.features
-    names = config.views or [name for name, view in options.items() if has_depth or not view.needs_depth]
-    views = choose_views(names, config.size, options)
+    names = config.views or [name for name, view in options.items() if _is_wanted(config, view, source.features)]
+    views = choose_views(names, config.size, options) if names else {}
     workspace = stated or stored_workspace(source.features)
-    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
+    read_for = [*views.values()]
+    if config.rerun and is_depth_feature(source.features.get(keys.depth(config.camera), {})):
+        read_for.append(ReprojectedView(clip="none"))  # a recording has the point cloud even if no view needs it
+    reader = FrameReader(source, config.camera, workspace, read_for, calibration)
     reader.check()
     return reader, views
+
+
+def _is_wanted(config: PreviewConfig, view: View, features: Features) -> bool:
+    """Whether a view that is not asked for by name is made: the dataset has what it needs and does not store it."""
+    if view.needs_depth and keys.depth(config.camera) not in features:
+        return False
+    asked = config.size is not None or config.calibration is not None or view != type(view)()
+    return asked or not any(keys.view(config.camera, output) in features for output in view.outputs)
+
+
+def _stored_views(features: Features) -> list[str]:
+    """Return the names of the images that are views."""
+    facts = {key: (feature.get("info") or {}).get("symview", {}) for key, feature in features.items()}
+    return [key.removeprefix(keys.rgb("")) for key, stated in facts.items() if "view" in stated]
 
 
 def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDArray]:
@@ -197,7 +216,12 @@ def _row(name: str, moment: Moment, frame: Frame, made: dict[str, NDArray], meas
     ]
     outlined = {f"{name} and workspace": with_outline(frame.rgb, frame.camera, frame.workspace)}
     others = {key: image for key, image in moment.stored.items() if key != name and not key.endswith("_depth")}
-    return Row(moment.title, facts, outlined | {key: _shown(image) for key, image in (others | made).items()})
+    images = {}
+    for key in others | made:
+        found = {origin: known[key] for origin, known in (("stored", others), ("computed", made)) if key in known}
+        for origin, image in found.items():
+            images[f"{key}, {origin}" if len(found) > 1 else key] = _shown(image)
+    return Row(moment.title, facts, outlined | images)
 
 
 def _warnings(

@@ -3,13 +3,16 @@ import logging
 import numpy as np
 import pytest
 
+from lerobot_symview.add_views import add_views
 from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.source_dataset import SourceDataset
+from lerobot_symview.views import make_view
 from lerobot_symview.workspace import Workspace
-from symview_eval.contact_sheet import OUTLINE, with_outline
+from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
 from symview_eval.preview import PreviewConfig, preview, read_moments, table_resolution
 from tests.conftest import make_camera
+from tests.lerobot_symview.derived import views_config
 
 
 def config(source, folder, **options):
@@ -29,6 +32,34 @@ def test_a_dataset_of_views_alone_is_shown_as_it_is(only_views, tmp_path):
     page = (preview(config(only_views, tmp_path, frames=1)) / "preview.html").read_text()
     assert page.count("<figcaption>") == 2
     assert "<figcaption>side_reproj</figcaption>" in page
+
+
+def test_views_of_a_dataset_are_shown_as_they_are_stored(with_views, tmp_path, caplog):
+    (moment,) = read_moments(SourceDataset(with_views), None, 0, [0])
+    with caplog.at_level(logging.WARNING, logger="symview_eval.preview"):
+        page = (preview(config(with_views, tmp_path, frames=1)) / "preview.html").read_text()
+    assert caplog.text == ""
+    for name in ("side_reproj", "side_persp", "side_persp_gripper"):
+        assert f'<figcaption>{name}</figcaption><img src="{png_uri(moment.stored[name])}"' in page
+    assert "side_reproj_seen" not in page
+    assert "<figcaption>side and workspace</figcaption>" in page
+
+
+@pytest.mark.parametrize("options", [{"views": ["reproj"]}, {"reproj": make_view("reproj", infill="none")}])
+def test_views_that_are_asked_for_are_computed_beside_the_stored_ones(with_views, tmp_path, options):
+    (moment,) = read_moments(SourceDataset(with_views), None, 0, [0])
+    page = (preview(config(with_views, tmp_path, frames=1, **options)) / "preview.html").read_text()
+    assert f'<figcaption>side_reproj, stored</figcaption><img src="{png_uri(moment.stored["side_reproj"])}"' in page
+    assert page.count("<figcaption>side_reproj, computed</figcaption>") == 1
+    assert page.count("<figcaption>side_reproj_seen</figcaption>") == 1
+    assert page.count("<figcaption>side_persp</figcaption>") == 1
+
+
+def test_a_view_that_is_not_stored_is_computed(recorded, tmp_path):
+    source = add_views(views_config(recorded, tmp_path / "persp", views=["persp"]))
+    page = (preview(config(source, tmp_path / "preview", frames=1)) / "preview.html").read_text()
+    for name in ("side_persp", "side_reproj", "side_reproj_seen"):
+        assert page.count(f"<figcaption>{name}</figcaption>") == 1
 
 
 def test_what_is_too_little_is_said(recorded, tmp_path, caplog):
@@ -98,3 +129,11 @@ def test_a_recording_holds_cameras_points_and_views(recorded, tmp_path):
     paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "preview.rrd").stream()}
     assert {"/world/side", "/world/side/image", "/world/points", "/world/workspace"} <= paths
     assert {f"/views/side_{name}" for name in ("reproj", "reproj_height", "reproj_seen", "persp")} <= paths
+
+
+def test_a_recording_holds_points_and_views_that_are_stored(with_views, tmp_path):
+    from rerun.experimental import RrdReader
+
+    preview(config(with_views, tmp_path, frames=1, rerun=True))
+    paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "preview.rrd").stream()}
+    assert {"/world/points", "/views/side_reproj", "/views/side_reproj_height", "/views/side_persp"} <= paths
