@@ -30,7 +30,7 @@ from lerobot_symview.hub import PushedDataset, push_dataset
 from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
 from lerobot_symview.staging import is_complete, open_partial, partial_folder, plain, remove_partial
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
-from lerobot_symview.workspace import check_visible
+from lerobot_symview.workspace import Workspace, check_visible
 
 logger = logging.getLogger(__name__)
 
@@ -67,6 +67,10 @@ class AddViewsConfig:
     """Options of the view persp."""
     calibration: Path | None = None
     """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
+    workspace: Workspace | None = None
+    """What the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by default what
+    `calibration` says, else the dataset, else the simulator's. The gripper's x and y count from its centre.
+    """
     keep: list[str] | None = None
     """Source image keys to keep, without `observation.images.`; by default all. `[]` leaves the views alone."""
     for_stock_policies: bool = False
@@ -146,8 +150,8 @@ def _check_apart(source: Path, target: Path) -> None:
 
 def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:
     calibration = read_calibration(config.calibration) if config.calibration else None
-    workspace = calibration.workspace if calibration is not None else None
-    workspace = workspace or stored_workspace(source.features)
+    in_file = calibration.workspace if calibration is not None else None
+    workspace = config.workspace or in_file or stored_workspace(source.features)
     views = config.chosen_views()
     added: Features = {}
     if calibration is not None:

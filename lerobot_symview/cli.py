@@ -132,7 +132,7 @@ def _reasons(error: BaseException) -> str:
         error = error.__cause__
         if str(error) not in messages[-1]:
             messages.append(str(error))
-    return ": ".join(message for message in messages if not message.startswith("Couldn't instantiate class"))
+    return ": ".join(message for message in messages if "Couldn't instantiate class" not in message)
 
 
 def _end(program: str, reason: str, code: int) -> NoReturn:

@@ -15,15 +15,16 @@ MINIMUM_VISIBLE = 0.6  # share of the working volume
 class Workspace:
     """A square, axis-aligned working area on the table z = 0.
 
-    Args:
-        center: x and y of its centre in the world, metres.
-        size: side T of the square, metres.
-        height_limit: height of the working volume above the table, metres.
+    Raises:
+        ValueError: if a number is not finite, or a length not positive.
     """
 
     center: tuple[float, float] = (0.45, 0.0)
+    """x and y of its centre in the world, metres."""
     size: float = 0.4
+    """Side T of the square, metres."""
     height_limit: float = 0.25
+    """Height of the working volume above the table, metres."""
 
     def __post_init__(self) -> None:
         if not np.isfinite([*self.center, self.size, self.height_limit]).all():

@@ -61,6 +61,10 @@ class PreviewConfig:
     """Options of the view persp."""
     calibration: Path | None = None
     """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
+    workspace: Workspace | None = None
+    """What the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by default what
+    `calibration` says, else the dataset, else the simulator's. The gripper's x and y count from its centre.
+    """
     max_holes: float = 0.5
     """Share of a reprojected view's pixels that may be inferred without a warning."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
@@ -163,11 +167,11 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
             return None, {}
         raise ValueError(f"the dataset has no camera {config.camera!r}: check --camera")
     calibration = read_calibration(config.calibration) if config.calibration else None
-    stated = calibration.workspace if calibration is not None else None
     options: dict[str, View] = {"reproj": config.reproj, "persp": config.persp}
     names = config.views or [name for name, view in options.items() if _is_wanted(config, view, source.features)]
     views = choose_views(names, config.size, options) if names else {}
-    workspace = stated or stored_workspace(source.features)
+    in_file = calibration.workspace if calibration is not None else None
+    workspace = config.workspace or in_file or stored_workspace(source.features)
     read_for = [*views.values()]
     if config.rerun and is_depth_feature(source.features.get(keys.depth(config.camera), {})):
         read_for.append(ReprojectedView(clip="none"))  # a recording has the point cloud even if no view needs it
@@ -180,7 +184,8 @@ def _is_wanted(config: PreviewConfig, view: View, features: Features) -> bool:
     """Whether a view that is not asked for by name is made: the dataset has what it needs and does not store it."""
     if view.needs_depth and keys.depth(config.camera) not in features:
         return False
-    asked = config.size is not None or config.calibration is not None or view != type(view)()
+    stated = (config.size, config.calibration, config.workspace)
+    asked = any(one is not None for one in stated) or view != type(view)()
     return asked or not any(keys.view(config.camera, output) in features for output in view.outputs)
 
 

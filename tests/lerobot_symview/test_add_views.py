@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import sys
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ from lerobot.scripts import lerobot_train
 
 from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.calibration import Calibration, parse_calibration, plain_calibration
+from lerobot_symview.calibration import Calibration, parse_calibration, parse_workspace, plain_calibration
 from lerobot_symview.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
 from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_symview.features import camera_features
 from lerobot_symview.hub import PushedDataset
 from lerobot_symview.placement import CameraSpec, CameraSpread
 from lerobot_symview.source_dataset import vectors
@@ -26,6 +28,8 @@ from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
 from tests.lerobot_symview.derived import contents, views_config
 from tests.lerobot_symview.test_upsampling import plane_depth
+
+NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 
 
 def parquet_columns(folder):
@@ -202,6 +206,42 @@ def test_a_camera_that_moves_is_followed(tmp_path):
         np.testing.assert_array_equal(stored, expected)
 
 
+def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
+    """On a wrist, say: every frame's reprojection is made with the pose of that frame."""
+    source = LeRobotDataset.create(
+        "test/wrist",
+        fps=10,
+        root=tmp_path / "wrist",
+        use_videos=False,
+        features=camera_features("wrist", 48, 64, {})
+        | {keys.ACTION: {"dtype": "float32", "shape": (1,), "names": None}},
+    )
+    rng, expected = np.random.default_rng(0), []
+    view = make_view("reproj", size=32, clip="none")
+    for azimuth in np.linspace(0, 2, 6):
+        pose = orbit_pose(0.8, azimuth, 0.6 + 0.1 * azimuth, (0.45, 0.0, 0.0)).astype(np.float32)
+        intrinsics = intrinsics_from_fov(0.9, 48, 64).astype(np.float32)
+        camera = stored_camera(intrinsics.ravel(), pose.ravel(), 48, 64)
+        rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        depth = plane_depth(camera, height=0.03).astype(np.float32)
+        expected.append(view.render(Frame(rgb, depth, camera, Workspace())))
+        frame = {keys.rgb("wrist"): rgb, keys.depth("wrist"): depth[..., None], keys.ACTION: np.zeros(1, np.float32)}
+        calibration = {keys.intrinsics("wrist"): intrinsics.ravel(), keys.world_from_cam("wrist"): pose.ravel()}
+        source.add_frame(frame | calibration | {"task": "nothing"})
+    source.save_episode()
+    source.finalize()
+    config = views_config(
+        tmp_path / "wrist", tmp_path / "derived", camera="wrist", views=["reproj"], size=None, reproj=view
+    )
+    result = add_views(config)
+    colors = np.rint(255 * images_of(result, keys.view("wrist", "reproj"))).astype(np.uint8).transpose(0, 2, 3, 1)
+    heights = images_of(result, keys.view("wrist", "reproj_height"))[:, 0]
+    for index, images in enumerate(expected):
+        np.testing.assert_array_equal(colors[index], images["reproj"])
+        np.testing.assert_array_equal(heights[index], images["reproj_height"])
+        assert index == 0 or (colors[index] != colors[index - 1]).any()
+
+
 @pytest.mark.parametrize("use_videos", [False, True])
 def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
     """Joint angles, a wide image, depth in uint16 millimetres, as a RealSense gives it."""
@@ -275,6 +315,49 @@ def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
     pq.write_table(table.set_column(index, table.schema.field(index), column), file)
     with pytest.raises(CalibrationError, match=r"episode 0, frame 4, camera 'side': .*not orthonormal"):
         add_views(views_config(source, tmp_path / "derived"))
+
+
+def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
+    camera = Camera(intrinsics_from_fov(0.8, 152, 152), orbit_pose(0.9, 0.4, 0.8, (2.0, 0.0, 0.0)), 152, 152)
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}))))
+    with pytest.raises(
+        CalibrationError, match=r"'side' sees 0% of the workspace, .*check the poses in .*cameras\.json"
+    ):
+        add_views(views_config(recorded, tmp_path / "derived", calibration=file))
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_recorded_camera_that_sees_too_little_is_warned_of(recorded, tmp_path, caplog):
+    with caplog.at_level("WARNING", logger="lerobot_symview.add_views"):
+        add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
+    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty where it sees none", caplog.text)
+
+
+def test_the_workspace_is_the_flags_then_the_files_then_the_datasets(recorded, tmp_path):
+    bare, file = tmp_path / "bare", tmp_path / "cameras.json"
+    source = LeRobotDataset("test/recorded", root=recorded)
+    calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
+    modify_features(source, remove_features=calibrations, output_dir=bare, repo_id="test/bare")
+    matrices = [source[0][key("side")].numpy() for key in (keys.intrinsics, keys.world_from_cam)]
+    camera = stored_camera(*matrices, 152, 152)
+    stated, in_file, in_dataset = Workspace((0.5, 0.1), 0.3), Workspace(size=0.35), Workspace()
+    made = {}
+    for name, data, workspace, more in (
+        ("flag", recorded, stated, {"workspace": stated}),
+        ("dataset", recorded, in_dataset, {}),
+        ("flag_before_file", bare, stated, {"workspace": stated, "calibration": file}),
+        ("file", bare, in_file, {"calibration": file}),
+    ):
+        file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}, in_file))))
+        result = add_views(views_config(data, tmp_path / name, views=["persp"], persp=NO_GRIPPER, size=None, **more))
+        info = json.loads((result / "meta" / "info.json").read_text())
+        facts = info["features"][keys.view("side", "persp")]["info"]["symview"]
+        assert parse_workspace(facts["workspace"]) == workspace, name
+        made[name] = images_of(result, keys.view("side", "persp"))
+    np.testing.assert_array_equal(made["flag"], made["flag_before_file"])
+    for name in ("dataset", "file"):
+        assert (made[name] != made["flag"]).any()
 
 
 @pytest.mark.parametrize("views", [[], ["reprojection"]])

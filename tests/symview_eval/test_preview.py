@@ -55,6 +55,14 @@ def test_views_that_are_asked_for_are_computed_beside_the_stored_ones(with_views
     assert page.count("<figcaption>side_persp</figcaption>") == 1
 
 
+def test_a_stated_workspace_is_shown_and_measured(recorded, with_views, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING, logger="symview_eval.preview"):
+        preview(config(recorded, tmp_path / "elsewhere", frames=1, workspace=Workspace((0.45, 0.6))))
+    assert "of the workspace, less than 60%: move or turn it" in caplog.text
+    stated = config(with_views, tmp_path / "stated", frames=1, workspace=Workspace(size=0.3))
+    assert "<figcaption>side_reproj, computed</figcaption>" in (preview(stated) / "preview.html").read_text()
+
+
 def test_a_view_that_is_not_stored_is_computed(recorded, tmp_path):
     source = add_views(views_config(recorded, tmp_path / "persp", views=["persp"]))
     page = (preview(config(source, tmp_path / "preview", frames=1)) / "preview.html").read_text()
