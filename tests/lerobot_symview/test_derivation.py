@@ -7,12 +7,14 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from lerobot.datasets import LeRobotDataset, aggregate_datasets
 
-from lerobot_symview import derivation
+from lerobot_symview import derivation, keys
 from lerobot_symview.add_views import add_views
 from lerobot_symview.cli import CommandError
 from lerobot_symview.source_dataset import SourceDataset
@@ -30,6 +32,16 @@ def small_parts(monkeypatch):
 def reference(recorded, small_parts, tmp_path):
     """What an undisturbed process writes."""
     return contents(add_views(views_config(recorded, tmp_path / "reference")))
+
+
+@pytest.fixture
+def several_files(recorded, tmp_path):
+    """A dataset of three times two episodes, in a file of their own each time, and so in three parts."""
+    folder = tmp_path / "several"
+    names = ["test/recorded"] * 3
+    aggregate_datasets(names, "test/several", [recorded] * 3, folder, concatenate_data=False)
+    assert len(list(folder.glob("data/*/*.parquet"))) == 3
+    return folder
 
 
 def test_the_number_of_processes_does_not_change_a_byte(recorded, reference, tmp_path):
@@ -135,3 +147,46 @@ def test_tables_are_read_however_their_row_groups_are_cut(recorded, reference, t
     for path, data in reference.items():
         if path.parts[0] == "data":
             assert (result / path).read_bytes() == data
+
+
+def test_a_source_of_several_files_has_the_views_of_each(several_files, with_views, tmp_path):
+    result = LeRobotDataset("test/derived", root=add_views(views_config(several_files, tmp_path / "derived")))
+    once = LeRobotDataset("test/with_views", root=with_views)
+    assert len(result) == 3 * len(once)
+    assert len(list(result.root.glob("data/*/*.parquet"))) == 3
+    images = [
+        key for key in once.meta.camera_keys if key.startswith((keys.view("side", "reproj"), keys.view("side", "p")))
+    ]
+    for index in range(len(result)):
+        copy, original = result[index], once[index % len(once)]
+        assert int(copy["index"]) == index
+        for key in images:
+            assert (copy[key] == original[key]).all(), (index, key)
+    for key in images:
+        np.testing.assert_allclose(result.meta.stats[key]["mean"], once.meta.stats[key]["mean"], rtol=1e-6)
+        assert result.meta.stats[key]["count"] == 3 * once.meta.stats[key]["count"]
+    for episode in range(6):
+        place = result.meta.get_data_file_path(episode)
+        assert episode in pq.read_table(result.root / place, columns=["episode_index"])["episode_index"].to_pylist()
+
+
+def test_two_killed_processes_lose_nothing_finished(several_files, tmp_path):
+    """SIGKILL before, amid and after the parts; then to the end, with the bytes of an undisturbed run."""
+    target, partial = tmp_path / "derived", tmp_path / "derived.partial"
+    command = [Path(sys.executable).parent / "symview-add-views", "--dataset.repo_id=test/recorded"]
+    command += [f"--root={several_files}", "--new_repo_id=test/derived", f"--new_root={target}", "--resume=true"]
+    command += ["--views=[reproj, persp]", f"--size={VIEW_SIZE}", "--num_workers=2"]
+    moments = [lambda: partial.exists(), lambda: any(partial.glob("dataset/data/*/*.parquet"))]
+    rng = np.random.default_rng(0)
+    for moment in moments:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not moment():
+            assert process.poll() is None
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.05))
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert not target.exists()
+    subprocess.run(command, check=True, capture_output=True)
+    assert not partial.exists()
+    assert contents(target) == contents(add_views(views_config(several_files, tmp_path / "undisturbed")))
