@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_policy_symview.augmentation import scale_down
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
-from lerobot_policy_symview.processor_views import metres
+from lerobot_policy_symview.processor_views import metres_of_depth, metres_of_heights
 
 Frame = dict[str, NDArray[Any]]
 """What a network needs of one observation, packed."""
@@ -38,11 +38,12 @@ class FrameCodec:
     def _pack(self, name: str, values: Tensor) -> Tensor:
         if values.ndim != 4:
             return values
+        colored = name == self._config.color_key
+        if not colored:  # first, since integers cannot be averaged
+            values = metres_of_heights(values) if self._config.is_computed else metres_of_depth(values)
         if self._config.encoder not in LIFTING:
             values = scale_down(values, self._config.image_size)
-        if name == self._config.color_key:
-            return (values * 255).round().to(torch.uint8)
-        return metres(values).to(torch.float16)
+        return (values * 255).round().to(torch.uint8) if colored else values.to(torch.float16)
 
 
 def _unpack(values: Tensor) -> Tensor:

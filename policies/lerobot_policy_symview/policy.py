@@ -24,7 +24,7 @@ from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.point_encoder import POINTS
 from lerobot_policy_symview.processor_files import check_processor_files
-from lerobot_policy_symview.processor_views import metres
+from lerobot_policy_symview.processor_views import metres_of_depth, metres_of_heights
 from lerobot_policy_symview.state_input import StateInput, camera_directions
 from lerobot_policy_symview.symmetry import Motion, Symmetry
 from lerobot_policy_symview.voxels import voxelize
@@ -217,7 +217,8 @@ class SymviewPolicy(PreTrainedPolicy):
         if self.config.modality == "rgb":
             return scale_down(color, self.config.image_size)
         assert self.config.height_key is not None
-        height = metres(batch[self.config.height_key])
+        height = batch[self.config.height_key]
+        height = metres_of_heights(height) if self.config.is_computed else metres_of_depth(height)
         if self.config.view == "top":  # from straight above, depth is the camera's height less the surface's
             camera_height = batch[keys.world_from_cam("top")].reshape(-1, 4, 4)[:, 2, 3]
             height = camera_height[:, None, None, None] - height
@@ -232,7 +233,7 @@ class SymviewPolicy(PreTrainedPolicy):
         gripper_z = state[:, entries.index("z")] if "z" in entries else state.new_full((len(state),), torch.inf)
         cloud = cloud_from_depth(
             batch[keys.rgb(camera)],
-            metres(batch[keys.depth(camera)]),
+            metres_of_depth(batch[keys.depth(camera)]),
             *self._calibration(batch),
             self.workspace,
             (gripper_z - view.clip_margin).clamp(min=view.clip_floor),

@@ -14,25 +14,56 @@ from torch import Tensor
 
 from lerobot_symview import keys
 from lerobot_symview.calibration import parse_calibration, parse_workspace
-from lerobot_symview.camera import CalibrationError, Camera, stored_camera
+from lerobot_symview.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
 from lerobot_symview.views import Frame, View, make_view
 
 if TYPE_CHECKING:
     from lerobot_symview.batched import FrameBatch
 
-METRES_AT_MOST = 10.0
+METRES_AT_MOST = 10.0  # nothing on a table is as far or as high, and nothing that is seen is within as many millimetres
 
 
-def metres(depth: Tensor) -> Tensor:
-    """Return depth or heights in metres, whatever unit LeRobot delivered them in.
+def metres_of_depth(depth: Tensor) -> Tensor:
+    """Return depth in metres, whatever unit LeRobot delivered it in.
 
     `lerobot-train` converts a dataset's metres to millimetres unless told otherwise and does not say so in the batch,
-    while environments yield metres. Nothing on a table is 10 m away, and a batch of millimetres that holds no value
-    above 10 shows nothing higher than 1 cm, so the magnitude decides.
+    while environments yield metres. What most pixels say decides, so that a few wrong ones change nothing.
+
+    Args:
+        depth: of any shape, integer millimetres (a RealSense's) or float of either unit; 0, negative or non-finite =
+            invalid.
+
+    Returns:
+        The same shape, float (float32 for integers); what is invalid stays so.
     """
-    if not depth.numel():
-        return depth
-    return torch.where(depth.abs().amax() > METRES_AT_MOST, depth / 1000.0, depth)  # no wait for a GPU's answer
+    if not depth.is_floating_point():
+        return _from_millimetres(depth.float())
+    finite = depth.isfinite()
+    measured, large = finite & (depth > 0), finite & (depth > METRES_AT_MOST)
+    return torch.where(2 * large.sum() > measured.sum(), _from_millimetres(depth), depth)  # a GPU's answer is not read
+
+
+def metres_of_heights(heights: Tensor) -> Tensor:
+    """Return heights above the table in metres, whatever unit LeRobot delivered them in.
+
+    Most of a table is bare, so it is not the majority that decides, as for depth: one height above 10 suffices. A batch
+    of millimetres without any shows nothing higher than 1 cm.
+
+    Args:
+        heights: of any shape, integer millimetres or float of either unit.
+
+    Returns:
+        The same shape, float (float32 for integers); what is not finite stays so.
+    """
+    if not heights.is_floating_point():
+        return _from_millimetres(heights.float())
+    in_millimetres = (heights.isfinite() & (heights > METRES_AT_MOST)).any()
+    return torch.where(in_millimetres, _from_millimetres(heights), heights)
+
+
+def _from_millimetres(lengths: Tensor) -> Tensor:
+    # By a plain number a GPU multiplies with the rounded reciprocal, which gives other bits.
+    return lengths / lengths.new_full((), MILLIMETRES_PER_METRE)
 
 
 @dataclass
@@ -112,7 +143,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
             cameras = [self._stated_camera(height, width)] * len(rgb)
         return FrameBatch(
             rgb,
-            metres(observation[depth].detach())[:, 0] if needs_depth else None,
+            metres_of_depth(observation[depth].detach())[:, 0] if needs_depth else None,
             cameras,
             self._workspace,
             observation[keys.STATE].detach()[:, self.gripper] if needs_gripper else None,

@@ -100,6 +100,14 @@ def test_millimetres_and_metres_give_the_same_action():
     torch.testing.assert_close(act(policy, in_millimetres), act(policy, raw))
 
 
+def test_a_cameras_own_depth_keeps_its_unit_whatever_one_pixel_says():
+    policy = make_policy(method="sideview_nonequi")
+    key = policy.config.height_key
+    raw = example_observation(policy.config)
+    raw[key][..., 0, 0] = 12.0
+    torch.testing.assert_close(act(policy, raw | {key: raw[key] * 1000}), act(policy, raw))
+
+
 def test_the_action_scale_is_shared_by_x_and_y():
     policy = make_policy()
     torch.testing.assert_close(policy.action_width, torch.tensor([0.05, 0.05, 0.05, 0.7, 0.5]))

@@ -6,9 +6,9 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
-from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres
+from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres_of_depth, metres_of_heights
 from lerobot_symview import keys
-from lerobot_symview.camera import CalibrationError
+from lerobot_symview.camera import CalibrationError, depth_in_metres
 from lerobot_symview.views import VIEWS, make_view
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
@@ -70,10 +70,44 @@ def test_missing_inputs_are_named(observed):
         ViewsProcessorStep(views=OPTIONS).observation(without)
 
 
-def test_metres_recognises_millimetres():
-    depth = torch.tensor([0.0, 0.8, 1.2])
-    torch.testing.assert_close(metres(depth), depth)
-    torch.testing.assert_close(metres(depth * 1000), depth)
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 12.0, -12.0, 0.0])
+def test_a_wrong_pixel_does_not_change_the_unit_of_depth(wrong):
+    depth = torch.tensor([0.0, 0.8, 1.2, wrong])
+    torch.testing.assert_close(metres_of_depth(depth), depth, equal_nan=True)
+    torch.testing.assert_close(metres_of_depth(depth * 1000), depth, equal_nan=True)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 0.0])
+def test_one_height_tells_millimetres(wrong):
+    heights = torch.tensor([0.0, 0.0, 0.0, 0.001, 0.03, wrong])
+    torch.testing.assert_close(metres_of_heights(heights), heights, equal_nan=True)
+    torch.testing.assert_close(metres_of_heights(heights * 1000), heights, equal_nan=True)
+
+
+@pytest.mark.parametrize("in_metres", [metres_of_depth, metres_of_heights])
+@pytest.mark.parametrize("dtype", [torch.uint16, torch.int16, torch.int32])
+def test_integers_are_millimetres(in_metres, dtype):
+    millimetres = np.array([0, 4, 5, 812], dtype=np.uint16)
+    made = in_metres(torch.from_numpy(millimetres).to(dtype))
+    assert made.dtype == torch.float32
+    np.testing.assert_array_equal(made.numpy(), depth_in_metres(millimetres))
+
+
+@pytest.mark.parametrize("in_metres", [metres_of_depth, metres_of_heights])
+def test_no_values_have_no_unit(in_metres):
+    assert in_metres(torch.zeros(0, 1, 4, 4)).shape == (0, 1, 4, 4)
+
+
+def test_integer_depth_of_a_camera_is_reprojected(observed):
+    """As `prepare_observation_for_inference` hands over a RealSense's."""
+    key = keys.depth("side")
+    millimetres = (observed[key] * 1000).round()
+    step = ViewsProcessorStep(views={"reproj": OPTIONS["reproj"]})
+    made, expected = (
+        step.observation(observed | {key: depth}) for depth in (millimetres.to(torch.uint16), millimetres / 1000)
+    )
+    for output in make_view("reproj").outputs:
+        assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
 
 
 def without_calibration(observed):
