@@ -34,6 +34,10 @@ class FrameBatch:
         cameras: B calibrations.
         workspace: what the views show.
         gripper: (B, 5) float32, as in `Frame`; None where it is not known.
+
+    Raises:
+        ValueError: if there is not one camera for each frame, or an image's size is not its camera's, or its type
+            another.
     """
 
     rgb: Tensor
@@ -41,6 +45,23 @@ class FrameBatch:
     cameras: list[Camera]
     workspace: Workspace
     gripper: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        count, rows, columns = len(self.rgb), *self.rgb.shape[-2:]
+        if self.rgb.shape != (count, 3, rows, columns) or self.rgb.dtype != torch.uint8:
+            raise ValueError(f"rgb must be (B, 3, H, W) uint8, got {tuple(self.rgb.shape)} {self.rgb.dtype}")
+        if len(self.cameras) != count:
+            raise ValueError(f"{count} frames need as many cameras, got {len(self.cameras)}")
+        sizes = {(camera.height, camera.width) for camera in self.cameras}
+        if sizes - {(rows, columns)}:
+            raise ValueError(f"rgb has {rows} x {columns} pixels, the cameras have {sorted(sizes)}")
+        if self.depth is not None and (
+            self.depth.shape != (count, rows, columns) or not self.depth.is_floating_point()
+        ):
+            raise ValueError(
+                f"depth must be {(count, rows, columns)} float metres as rgb, "
+                f"got {tuple(self.depth.shape)} {self.depth.dtype}"
+            )
 
 
 def can_batch(view: View) -> bool:

@@ -36,6 +36,9 @@ class Frame:
         workspace: what the view shows.
         gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture; None
             where it is not known.
+
+    Raises:
+        ValueError: if an image's size is not the camera's, or its type another.
     """
 
     rgb: NDArray[np.uint8]
@@ -43,6 +46,16 @@ class Frame:
     camera: Camera
     workspace: Workspace
     gripper: NDArray[np.floating] | None = None
+
+    def __post_init__(self) -> None:
+        # Compiled kernels read the images by the camera's size and check no index.
+        size = (self.camera.height, self.camera.width)
+        if self.rgb.shape != (*size, 3) or self.rgb.dtype != np.uint8:
+            raise ValueError(f"rgb must be {(*size, 3)} uint8 as its camera, got {self.rgb.shape} {self.rgb.dtype}")
+        if self.depth is not None and (self.depth.shape != size or self.depth.dtype.kind not in "fiu"):
+            raise ValueError(
+                f"depth must be {size} float or integer as its camera, got {self.depth.shape} {self.depth.dtype}"
+            )
 
 
 class View(Protocol):

@@ -10,6 +10,7 @@ from lerobot_symview.batched import FrameBatch, can_batch, nearest_known_batch, 
 from lerobot_symview.infill import nearest_known
 from lerobot_symview.views import Frame, make_view
 from lerobot_symview.workspace import Workspace
+from tests.conftest import make_camera
 from tests.lerobot_symview.cameras import SHAPE, cameras
 from tests.lerobot_symview.test_infill import MASKS
 from tests.lerobot_symview.test_zbuffer import random_depth
@@ -73,18 +74,41 @@ def test_nearest_pixels_are_those_found_one_by_one(device, known):
     assert not found[1].any()
 
 
+def colored_batch(**changes):
+    """Two small black frames without depth."""
+    images = {"rgb": torch.zeros(2, 3, 8, 8, dtype=torch.uint8), "depth": None}
+    return FrameBatch(**{**images, "cameras": [make_camera(size=8)] * 2, "workspace": Workspace(), **changes})
+
+
 @pytest.mark.parametrize("options", [{"infill": "local"}, {"source_scale": 2}])
 def test_what_is_not_batched_says_so(options):
     view = make_view("reproj", **options)
     assert not can_batch(view)
-    batch = FrameBatch(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), None, [], Workspace())
+    batch = colored_batch()
     with pytest.raises(ValueError, match="frame by frame"):
         render_batch(view, batch)
 
 
 def test_missing_inputs_are_named():
-    batch = FrameBatch(torch.zeros(1, 3, 8, 8, dtype=torch.uint8), None, [], Workspace())
+    batch = colored_batch()
     with pytest.raises(ValueError, match="needs depth"):
         render_batch(make_view("reproj"), batch)
     with pytest.raises(ValueError, match="gripper"):
         render_batch(make_view("persp"), batch)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": torch.zeros(2, 8, 8, 3, dtype=torch.uint8)}, r"rgb must be \(B, 3, H, W\) uint8, got \(2, 8, 8, 3\)"),
+        ({"rgb": torch.zeros(2, 3, 8, 8)}, "rgb must be .*uint8.*float32"),
+        ({"rgb": torch.zeros(2, 3, 6, 8, dtype=torch.uint8)}, r"rgb has 6 x 8 pixels, the cameras have \[\(8, 8\)\]"),
+        ({"cameras": [make_camera(size=8)]}, "2 frames need as many cameras, got 1"),
+        ({"cameras": [make_camera(size=8), make_camera(size=6)]}, r"8 x 8 pixels, .*\(6, 6\)"),
+        ({"depth": torch.zeros(2, 1, 8, 8)}, r"depth must be \(2, 8, 8\) .*got \(2, 1, 8, 8\)"),
+        ({"depth": torch.zeros(2, 8, 8, dtype=torch.int32)}, "depth must be .*float metres.*int32"),
+    ],
+)
+def test_images_that_are_not_the_cameras_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        colored_batch(**changes)

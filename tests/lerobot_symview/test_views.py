@@ -104,6 +104,22 @@ def test_invalid_depth_never_writes(bad):
     assert images["reproj_height"].max() == 0
 
 
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        ({"rgb": np.zeros((48, 96, 3), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(48, 96, 3\)"),
+        ({"rgb": np.zeros((96, 96, 4), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(96, 96, 4\)"),
+        ({"rgb": np.zeros((96, 96, 3), np.float32)}, "rgb must be .*uint8.*float32"),
+        ({"depth": np.zeros((96, 48), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 48\)"),
+        ({"depth": np.zeros((96, 96, 1), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 96, 1\)"),
+        ({"depth": np.zeros((96, 96), bool)}, "depth must be .*float or integer.*bool"),
+    ],
+)
+def test_images_that_are_not_the_cameras_are_refused(images, message):
+    with pytest.raises(ValueError, match=message):
+        replace(make_frame(), **images)
+
+
 def test_reprojection_without_depth_names_the_alternative():
     frame = make_frame()
     with pytest.raises(ValueError, match="persp"):
