@@ -69,7 +69,7 @@ def _from_millimetres(lengths: Tensor) -> Tensor:
 @dataclass
 @ProcessorStepRegistry.register(name="symview_views")
 class ViewsProcessorStep(ObservationProcessorStep):
-    """Adds views of one camera to an observation; does nothing for a view that is already there.
+    """Adds views of one camera to an observation; leaves alone what is already there.
 
     An observation without its camera's calibration, such as a real robot's, is taken to have the stated one.
 
@@ -94,7 +94,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._workspace = (stated and not self.workspace and stated.workspace) or parse_workspace(self.workspace)
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
-        """Return the observation with each missing view, as float32 (B, C, size, size) like any other image."""
+        """Return the observation with what is missing of its views: float32 (B, C, size, size), as any other image."""
         missing = {
             name: view
             for name, view in self._views.items()
@@ -107,9 +107,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
         batch = self._batch(observation, list(missing), needs_depth, needs_gripper)
         for view in missing.values():
             for output, images in _render(view, batch).items():
-                observation[keys.view(self.camera, output)] = (
-                    images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
-                )
+                made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
+                observation.setdefault(keys.view(self.camera, output), made)
         return observation
 
     def get_config(self) -> dict[str, Any]:

@@ -46,6 +46,18 @@ def test_a_view_that_is_present_is_left_alone(observed):
     assert step.observation(marked)["observation.images.side_reproj"].shape == (1, 3, 4, 4)
 
 
+@pytest.mark.parametrize("missing", make_view("reproj").outputs)
+def test_of_a_view_only_what_is_missing_is_added(observed, missing):
+    step = ViewsProcessorStep(views={"reproj": OPTIONS["reproj"]})
+    own = step.observation(dict(observed))
+    outputs = [keys.view("side", output) for output in make_view("reproj").outputs]
+    marked = own | {key: torch.full_like(own[key], 0.5) for key in outputs}
+    del marked[keys.view("side", missing)]
+    made = step.observation(dict(marked))
+    for key in outputs:
+        assert torch.equal(made[key], marked.get(key, own[key])), key
+
+
 def test_every_sample_of_a_batch_uses_its_own_calibration(observed):
     two = {key: torch.cat([value, value]) for key, value in observed.items()}
     pose = two[keys.world_from_cam("side")].clone().reshape(2, 4, 4)
