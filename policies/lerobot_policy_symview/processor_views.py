@@ -10,6 +10,7 @@ import torch
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import RobotObservation
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_symview import keys
@@ -71,7 +72,8 @@ def _from_millimetres(lengths: Tensor) -> Tensor:
 class ViewsProcessorStep(ObservationProcessorStep):
     """Adds views of one camera to an observation; leaves alone what is already there.
 
-    An observation without its camera's calibration, such as a real robot's, is taken to have the stated one.
+    Colour is float in [0, 1] or uint8. Calibration is flat, (9,) and (16,), or square, (3, 3) and (4, 4), for all
+    frames or for each; an observation without it, such as a real robot's, is taken to have the stated one.
 
     Args:
         views: name -> options of every view wanted, as for `lerobot_symview.views.make_view`.
@@ -128,15 +130,17 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
         color, depth = keys.rgb(self.camera), keys.depth(self.camera)
         needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if needs_gripper else [])
-        matrices = [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        matrices = {keys.intrinsics(self.camera): 3, keys.world_from_cam(self.camera): 4}
         own = self._stated is None or all(key in observation for key in matrices)
-        missing = [key for key in needed + (matrices if own else []) if key not in observation]
+        missing = [key for key in needed + (list(matrices) if own else []) if key not in observation]
         if missing:
             raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
-        rgb = (observation[color].detach() * 255).round().to(torch.uint8)
+        rgb = observation[color].detach()
+        if rgb.dtype != torch.uint8:
+            rgb = (rgb * 255).round().to(torch.uint8)
         height, width = rgb.shape[2:]
         if own:
-            stored = (observation[key].detach().cpu().numpy() for key in matrices)
+            stored = (_matrices(key, observation[key], side, len(rgb)) for key, side in matrices.items())
             cameras = [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
         else:
             cameras = [self._stated_camera(height, width)] * len(rgb)
@@ -156,6 +160,14 @@ class ViewsProcessorStep(ObservationProcessorStep):
                 f"the observation has {height} x {width}"
             )
         return self._stated
+
+
+def _matrices(key: str, stated: Tensor, side: int, count: int) -> NDArray[np.floating]:
+    """Return (count, side^2): a matrix for each frame, or one for all, which LeRobot leaves without a batch axis."""
+    shapes = [(side**2,), (side, side), (count, side**2), (count, side, side)]
+    if tuple(stated.shape) not in shapes:
+        raise CalibrationError(f"{key} has shape {tuple(stated.shape)}, expected one of {shapes}")
+    return np.broadcast_to(stated.detach().cpu().numpy().reshape(-1, side**2), (count, side**2))
 
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:

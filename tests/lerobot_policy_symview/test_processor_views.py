@@ -69,6 +69,42 @@ def test_every_sample_of_a_batch_uses_its_own_calibration(observed):
     assert not torch.equal(images[1:], alone)
 
 
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("square", [False, True])
+def test_calibration_may_be_unbatched_and_square(observed, batch, square):
+    """LeRobot adds a batch axis to images and states only."""
+    several = {key: torch.cat([value] * batch) for key, value in observed.items()}
+    expected = ViewsProcessorStep(views=OPTIONS).observation(dict(several))
+    for count in ((), (batch,)):
+        matrices = {
+            key: several[key][0].reshape((side, side) if square else (side**2,)).expand(*count, *[-1] * (1 + square))
+            for key, side in ((keys.intrinsics("side"), 3), (keys.world_from_cam("side"), 4))
+        }
+        made = ViewsProcessorStep(views=OPTIONS).observation(several | matrices)
+        for name in VIEWS:
+            for output in make_view(name).outputs:
+                assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
+
+
+def test_calibration_of_another_shape_is_refused(observed):
+    wrong = observed | {keys.intrinsics("side"): torch.eye(4)[None]}
+    with pytest.raises(
+        CalibrationError, match=r"side\.intrinsics has shape \(1, 4, 4\), expected one of \[\(9,\), \(3, 3\)"
+    ):
+        ViewsProcessorStep(views=OPTIONS).observation(wrong)
+
+
+def test_colour_may_be_uint8(observed):
+    key = keys.rgb("side")
+    made, expected = (
+        ViewsProcessorStep(views=OPTIONS).observation(observed | {key: image})
+        for image in ((observed[key] * 255).round().to(torch.uint8), observed[key])
+    )
+    for name in VIEWS:
+        for output in make_view(name).outputs:
+            assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
+
+
 def test_the_step_is_rebuilt_from_its_configuration(observed):
     step = ViewsProcessorStep(views=OPTIONS, workspace={"center": [0.45, 0.0], "size": 0.3, "height_limit": 0.2})
     again = ViewsProcessorStep(**step.get_config())
