@@ -171,11 +171,11 @@ def _matrices(key: str, stated: Tensor, side: int, count: int) -> NDArray[np.flo
 
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
-    """Return each output for all frames, on their device: together on a GPU, by the compiled kernels elsewhere."""
+    """Return each output for all frames, on their device: together by CUDA, by the compiled kernels elsewhere."""
     from lerobot_symview.batched import can_batch, render_batch
 
     device = batch.rgb.device
-    if device.type != "cpu" and can_batch(view):
+    if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which the bits depend on
         return render_batch(view, batch)
     rgb = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu().numpy()
     depth, gripper = (None if one is None else one.cpu().numpy() for one in (batch.depth, batch.gripper))

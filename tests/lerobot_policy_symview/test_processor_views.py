@@ -105,6 +105,23 @@ def test_colour_may_be_uint8(observed):
             assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
 
 
+def test_devices_without_float64_leave_the_views_to_the_cpu(observed, monkeypatch):
+    class Mps(str):
+        type = "mps"
+
+    class ElsewhereTensor(torch.Tensor):
+        device = Mps("cpu")  # what torch takes to be the CPU, and our code an Apple GPU
+
+    def refuse(*_):
+        raise AssertionError("float64 on an Apple GPU")
+
+    monkeypatch.setattr("lerobot_symview.batched.render_batch", refuse)
+    key = keys.rgb("side")
+    elsewhere = observed | {key: observed[key].as_subclass(ElsewhereTensor)}
+    made, expected = (ViewsProcessorStep(views=OPTIONS).observation(one) for one in (elsewhere, dict(observed)))
+    assert torch.equal(made[keys.view("side", "reproj")], expected[keys.view("side", "reproj")])
+
+
 def test_the_step_is_rebuilt_from_its_configuration(observed):
     step = ViewsProcessorStep(views=OPTIONS, workspace={"center": [0.45, 0.0], "size": 0.3, "height_limit": 0.2})
     again = ViewsProcessorStep(**step.get_config())
