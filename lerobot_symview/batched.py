@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_symview.camera import Camera
 from lerobot_symview.gripper import gripper_image
 from lerobot_symview.perspective import warp_map
-from lerobot_symview.views import PerspectiveView, ReprojectedView, View
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, check_gripper
 from lerobot_symview.workspace import Workspace
 from lerobot_symview.zbuffer import EMPTY, grid_from_pixel
 
@@ -75,7 +75,8 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """Return every output of `view`: (B, 3, size, size) uint8 colour or (B, size, size) float32 metres.
 
     Raises:
-        ValueError: if `can_batch` says no, or the frames lack depth or gripper that the view needs.
+        ValueError: if `can_batch` says no, the frames lack depth or gripper that the view needs, or the gripper's state
+            is not finite.
     """
     if not can_batch(view):
         raise ValueError(f"{view} is made frame by frame only")
@@ -211,4 +212,9 @@ def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
 
 
 def _gripper_heights(batch: FrameBatch) -> list[float | None]:
-    return [None] * len(batch.rgb) if batch.gripper is None else batch.gripper[:, 2].tolist()
+    if batch.gripper is None:
+        return [None] * len(batch.rgb)
+    states = batch.gripper.tolist()
+    for state in states:  # here, where a GPU is waited for anyway
+        check_gripper(state)
+    return [z for _, _, z, *_ in states]

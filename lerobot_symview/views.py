@@ -6,9 +6,11 @@ dataclass with the members of `View`, decorated with `@register_view(name)`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from numbers import Integral
 from typing import Any, ClassVar, Literal, Protocol
 
 import cv2
@@ -38,7 +40,7 @@ class Frame:
             where it is not known.
 
     Raises:
-        ValueError: if an image's size is not the camera's, or its type another.
+        ValueError: if an image's size is not the camera's, or its type another, or the gripper's state is not finite.
     """
 
     rgb: NDArray[np.uint8]
@@ -56,6 +58,14 @@ class Frame:
             raise ValueError(
                 f"depth must be {size} float or integer as its camera, got {self.depth.shape} {self.depth.dtype}"
             )
+        if self.gripper is not None:
+            check_gripper(self.gripper.tolist())
+
+
+def check_gripper(state: list[float]) -> None:
+    """Raise a ValueError for a gripper's state that is not finite: it would cut off or hide all there is."""
+    if not all(map(math.isfinite, state)):
+        raise ValueError(f"the gripper's x, y, z, yaw and aperture must be finite, got {state}")
 
 
 class View(Protocol):
@@ -176,10 +186,13 @@ class ReprojectedView:
         _check_size(self.size)
         if self.infill not in INFILLS:
             raise ValueError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
-        if isinstance(self.clip, str) and self.clip not in ("gripper", "none"):
+        if self.clip not in ("gripper", "none") and (isinstance(self.clip, str) or not self.clip > -math.inf):
             raise ValueError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
-        if not 1 <= self.source_scale <= 8:
-            raise ValueError(f"source_scale must lie in 1 to 8, got {self.source_scale}")
+        for name, metres in {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor}.items():
+            if not math.isfinite(metres):
+                raise ValueError(f"{name} must be finite metres, got {metres}")
+        if not isinstance(self.source_scale, Integral) or not 1 <= self.source_scale <= 8:
+            raise ValueError(f"source_scale must be a whole number in 1 to 8, got {self.source_scale}")
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the outputs; where nothing is known, black and 0."""
@@ -245,7 +258,9 @@ class PerspectiveView:
 
     def __post_init__(self) -> None:
         _check_size(self.size)
-        if isinstance(self.plane_height, str) and self.plane_height != "gripper":
+        if self.plane_height != "gripper" and (
+            isinstance(self.plane_height, str) or not math.isfinite(self.plane_height)
+        ):
             raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
     def plane(self, gripper_height: float | None) -> float:
@@ -288,5 +303,5 @@ def _height(frame: Frame) -> float | None:
 
 
 def _check_size(size: int) -> None:
-    if not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"a view's size must lie in {SMALLEST} to {LARGEST} pixels, got {size}")
+    if not isinstance(size, Integral) or not SMALLEST <= size <= LARGEST:
+        raise ValueError(f"a view's size must be a whole number of {SMALLEST} to {LARGEST} pixels, got {size}")

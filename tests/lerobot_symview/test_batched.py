@@ -112,3 +112,10 @@ def test_missing_inputs_are_named():
 def test_images_that_are_not_the_cameras_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         colored_batch(**changes)
+
+
+@pytest.mark.parametrize("options", [{}, {"plane_height": "gripper"}])
+def test_a_gripper_that_is_nowhere_is_refused(options):
+    gripper = torch.tensor([[0.0, 0.0, 0.2, 0.0, 1.0], [0.0, 0.0, torch.nan, 0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"gripper.*must be finite, got .*nan"):
+        render_batch(make_view("persp", **options), colored_batch(gripper=gripper))

@@ -105,7 +105,7 @@ def test_invalid_depth_never_writes(bad):
 
 
 @pytest.mark.parametrize(
-    ("images", "message"),
+    ("wrong", "message"),
     [
         ({"rgb": np.zeros((48, 96, 3), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(48, 96, 3\)"),
         ({"rgb": np.zeros((96, 96, 4), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(96, 96, 4\)"),
@@ -113,11 +113,13 @@ def test_invalid_depth_never_writes(bad):
         ({"depth": np.zeros((96, 48), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 48\)"),
         ({"depth": np.zeros((96, 96, 1), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 96, 1\)"),
         ({"depth": np.zeros((96, 96), bool)}, "depth must be .*float or integer.*bool"),
+        ({"gripper": np.array([0.0, 0.0, np.nan, 0.0, 1.0])}, "gripper.*must be finite, got .*nan"),
+        ({"gripper": np.array([0.0, 0.0, 0.2, 0.0, np.inf])}, "gripper.*must be finite, got .*inf"),
     ],
 )
-def test_images_that_are_not_the_cameras_are_refused(images, message):
+def test_what_no_camera_or_encoder_measures_is_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
-        replace(make_frame(), **images)
+        replace(make_frame(), **wrong)
 
 
 def test_reprojection_without_depth_names_the_alternative():
@@ -138,7 +140,18 @@ def test_an_unknown_view_is_answered_with_the_nearest_known_one():
         ("reproj", {"clip": "high"}),
         ("reproj", {"size": 0}),
         ("reproj", {"source_scale": 0}),
+        ("reproj", {"size": 76.5}),
+        ("reproj", {"clip": np.nan}),
+        ("reproj", {"clip": -np.inf}),
+        ("reproj", {"clip_margin": np.nan}),
+        ("reproj", {"clip_margin": np.inf}),
+        ("reproj", {"clip_floor": np.nan}),
+        ("reproj", {"clip_floor": -np.inf}),
+        ("reproj", {"source_scale": 1.5}),
+        ("reproj", {"source_scale": np.nan}),
         ("persp", {"plane_height": "table"}),
+        ("persp", {"plane_height": np.nan}),
+        ("persp", {"plane_height": np.inf}),
     ],
 )
 def test_impossible_options_are_refused(name, options):
@@ -170,6 +183,13 @@ def test_a_fixed_height_cuts_wherever_the_gripper_is():
         frame = make_frame(gripper=(0.0, 0.0, gripper_height, 0.0, 1.0))
         heights = make_view("reproj", size=SIZE, clip=0.03).render(frame)["reproj_height"]
         assert 0.02 < heights.max() <= 0.03 + 1e-6
+
+
+def test_an_infinite_height_cuts_nothing():
+    frame = make_frame()
+    expected = make_view("reproj", size=SIZE, clip="none").render(frame)
+    for output, image in make_view("reproj", size=SIZE, clip=np.inf).render(frame).items():
+        np.testing.assert_array_equal(image, expected[output])
 
 
 def test_the_plane_follows_the_gripper_if_asked():
