@@ -1,5 +1,7 @@
 """Calibration from a file, for datasets and robots that do not carry their own.
 
+Matrices are rounded to float32, as which datasets store them, so that a view has the same bits whichever it is made by.
+
 The file is YAML or JSON:
 
     units: m                        # of the poses, m or mm; K is in pixels
@@ -156,9 +158,9 @@ def _camera(entries: Any, metres: float) -> Camera:
     for side in ("height", "width"):
         if not isinstance(entries[side], int) or entries[side] < 1:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
-    world_from_cam = _matrix("world_from_cam", entries, 4)
+    intrinsics, world_from_cam = _matrix("intrinsics", entries, 3), _matrix("world_from_cam", entries, 4)
     world_from_cam[:3, 3] *= metres
-    return Camera(_matrix("intrinsics", entries, 3), world_from_cam, entries["height"], entries["width"])
+    return Camera(_as_stored(intrinsics), _as_stored(world_from_cam), entries["height"], entries["width"])
 
 
 def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
@@ -166,6 +168,11 @@ def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
         return np.array(entries[name], dtype=np.float64).reshape(side, side)
     except (TypeError, ValueError):
         raise CalibrationError(f"{name} must be {side} rows of {side} numbers, got {entries[name]!r}") from None
+
+
+def _as_stored(matrix: Array) -> Array:
+    with np.errstate(over="ignore"):  # the camera refuses what is infinite
+        return matrix.astype(np.float32).astype(np.float64)
 
 
 def _strangers(owner: str, entries: Mapping[Any, Any], known: tuple[str, ...]) -> list[str]:

@@ -8,13 +8,21 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import torch
 import yaml
 from lerobot.datasets import LeRobotDataset, modify_features
 from lerobot.scripts import lerobot_train
 
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.calibration import Calibration, parse_calibration, parse_workspace, plain_calibration
+from lerobot_symview.calibration import (
+    Calibration,
+    parse_calibration,
+    parse_workspace,
+    plain_calibration,
+    read_calibration,
+)
 from lerobot_symview.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
 from lerobot_symview.cli import CommandError, DatasetTarget
 from lerobot_symview.features import camera_features
@@ -242,24 +250,23 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         assert index == 0 or (colors[index] != colors[index - 1]).any()
 
 
-@pytest.mark.parametrize("use_videos", [False, True])
-def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
-    """Joint angles, a wide image, depth in uint16 millimetres, as a RealSense gives it."""
-    camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
+def record_real_robot(folder, camera, rgb, use_videos=False):
+    """Write three frames with joint angles and depth in uint16 millimetres, as a RealSense gives it; return that."""
+    size = (camera.height, camera.width)
     joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
     kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
     source = LeRobotDataset.create(
         "test/real",
         fps=10,
-        root=tmp_path / "real",
+        root=folder,
         use_videos=use_videos,
         features={
             keys.STATE: joints,
             keys.ACTION: joints,
-            keys.rgb("front"): {"dtype": kind, "shape": (96, 128, 3), "names": axes},
+            keys.rgb("front"): {"dtype": kind, "shape": (*size, 3), "names": axes},
             keys.depth("front"): {
                 "dtype": "image",
-                "shape": (96, 128, 1),
+                "shape": (*size, 1),
                 "names": axes,
                 "info": {"is_depth_map": True},
             },
@@ -269,11 +276,18 @@ def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, us
     rng = np.random.default_rng(0)
     for _ in range(3):
         angles = rng.normal(size=6).astype(np.float32)
-        rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
         frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
         source.add_frame(frame | {"task": "nothing"})
     source.save_episode()
     source.finalize()
+    return depth
+
+
+@pytest.mark.parametrize("use_videos", [False, True])
+def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
+    camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
+    rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
+    record_real_robot(tmp_path / "real", camera, rgb, use_videos)
     file = tmp_path / "cameras.json"
     calibration = Calibration({"front": camera}, Workspace(size=0.3))
     file.write_text(json.dumps(plain_calibration(calibration)))
@@ -289,6 +303,35 @@ def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, us
     facts = json.loads((result / "meta" / "info.json").read_text())["features"][keys.view("front", "reproj")]["info"]
     assert facts["symview"]["workspace"]["size"] == 0.3
     assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
+
+
+def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_same_bits(tmp_path):
+    camera = Camera(intrinsics_from_fov(0.83, 96, 128), orbit_pose(0.91, 0.37, 0.81, (0.45, 0.01, 0.0)), 96, 128)
+    rgb = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+    depth = record_real_robot(tmp_path / "real", camera, rgb)
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(plain_calibration(Calibration({"front": camera}))))
+    options = {"reproj": {"size": VIEW_SIZE, "clip": "none"}, "persp": {"size": VIEW_SIZE, "gripper": False}}
+    views = {name: make_view(name, **chosen) for name, chosen in options.items()}
+    made = add_views(
+        views_config(tmp_path / "real", tmp_path / "derived", camera="front", calibration=file, size=None, **views)
+    )
+    item = LeRobotDataset("test/derived", root=made, depth_output_unit="m")[0]
+    matrices = {key: item[key] for key in (keys.intrinsics("front"), keys.world_from_cam("front"))}
+    observed = {
+        keys.rgb("front"): torch.from_numpy(rgb).permute(2, 0, 1)[None],
+        keys.depth("front"): torch.from_numpy(depth).permute(2, 0, 1)[None],
+    }
+    online = ViewsProcessorStep(options, "front", calibration=plain_calibration(read_calibration(file)))
+    recomputed = Frame(rgb, depth[..., 0], stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace())
+    for observation in (dict(observed), observed | matrices):
+        images = online.observation(observation)
+        for view in views.values():
+            for output, again in view.render(recomputed).items():
+                key = keys.view("front", output)
+                again = again.transpose(2, 0, 1) / np.float32(255) if again.ndim == 3 else again[None]
+                np.testing.assert_array_equal(images[key][0].numpy(), item[key].numpy(), err_msg=key)
+                np.testing.assert_array_equal(again, item[key].numpy(), err_msg=key)
 
 
 def test_without_the_grippers_pose_the_flags_that_do_without_are_named(recorded, tmp_path):

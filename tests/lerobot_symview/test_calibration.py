@@ -39,6 +39,19 @@ def test_poses_may_be_in_millimetres():
     np.testing.assert_allclose(calibration.camera("front").position, make_camera().position)
 
 
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 1000.0)])
+def test_matrices_are_those_that_a_dataset_stores(units, scale):
+    pose = make_camera(17.0, 23.0, size=64).world_from_cam.copy()
+    pose[:3, 3] *= scale
+    parsed = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": units})
+    camera = parsed.camera("front")
+    for matrix in (camera.intrinsics, camera.world_from_cam):
+        np.testing.assert_array_equal(matrix, matrix.astype(np.float32))
+    again = parse_calibration(json.loads(json.dumps(plain_calibration(parsed)))).camera("front")
+    np.testing.assert_array_equal(again.world_from_cam, camera.world_from_cam)
+    np.testing.assert_array_equal(again.intrinsics, camera.intrinsics)
+
+
 def test_the_example_in_the_documentation_is_valid():
     import lerobot_symview.calibration as module
 
@@ -67,6 +80,7 @@ STRETCHED = np.diag([1.1, 1.0, 1.0, 1.0]).tolist()
         (content(intrinsics=[[60, 0, 310], [0, 60, 31], [0, 0, 1]]), r"principal point .* lies outside"),
         (content(world_from_cam=REFLECTED), "left-handed"),
         (content(world_from_cam=STRETCHED), "not orthonormal"),
+        (content(intrinsics=[[1e300, 0, 31], [0, 60, 31], [0, 0, 1]]), "must be finite"),
         (content(world_from_cam="somewhere"), "world_from_cam must be 4 rows of 4 numbers"),
         (content() | {"workspace": {"size": -1}}, "workspace: .*positive"),
         (
