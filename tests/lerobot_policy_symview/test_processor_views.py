@@ -8,8 +8,9 @@ from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres_of_depth, metres_of_heights
 from lerobot_symview import keys
-from lerobot_symview.camera import CalibrationError, depth_in_metres
-from lerobot_symview.views import VIEWS, make_view
+from lerobot_symview.camera import CalibrationError, depth_in_metres, stored_camera
+from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view
+from lerobot_symview.workspace import Workspace
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
 from tests.conftest import VIEW_SIZE
@@ -37,6 +38,58 @@ def test_online_and_offline_views_are_the_same_bits(observed, with_views):
         for output in make_view(name).outputs:
             key = keys.view("side", output)
             np.testing.assert_array_equal(online[key][0].numpy(), offline[key].numpy(), err_msg=key)
+
+
+def in_metres(depth):
+    return depth
+
+
+def in_millimetres(depth):
+    return np.rint(1000 * depth).astype(np.uint16)
+
+
+def spoilt(depth, values):
+    wrong = depth.copy()
+    for start, value in enumerate(values):
+        wrong.reshape(-1)[start::31] = value
+    return wrong
+
+
+def with_invalid_pixels(depth):
+    return spoilt(depth, [np.nan, -np.inf, 0.0, -0.5])
+
+
+def with_far_pixels(depth):
+    return spoilt(depth, [np.inf, 12.0])
+
+
+@pytest.mark.parametrize("sensed", [in_metres, in_millimetres, with_invalid_pixels, with_far_pixels])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        *(("reproj", {"infill": infill, "clip": clip}) for infill in INFILLS for clip in ("none", 0.05, "gripper")),
+        *(("reproj", {"infill": infill, "source_scale": 2, "mask": True}) for infill in INFILLS),
+        ("reproj", {"height": False, "mask": True, "clip_margin": 0.03, "clip_floor": 0.02}),
+        ("persp", {"plane_height": "gripper"}),
+        ("persp", {"plane_height": 0.03, "gripper": False}),
+    ],
+)
+def test_with_any_options_and_depth_the_step_gives_the_bits_of_the_view(observed, name, options, sensed):
+    view = make_view(name, size=VIEW_SIZE, **options)
+    matrices = (observed[key("side")][0].numpy() for key in (keys.intrinsics, keys.world_from_cam))
+    rgb = (observed[keys.rgb("side")][0] * 255).round().byte().permute(1, 2, 0).numpy()
+    depth = sensed(observed[keys.depth("side")][0, 0].numpy())
+    camera = stored_camera(*matrices, *depth.shape)
+    offline = view.render(Frame(rgb, depth, camera, Workspace(), observed[keys.STATE][0].numpy()))
+    observation = observed | {keys.depth("side"): torch.from_numpy(depth)[None, None]}
+    online = ViewsProcessorStep(views={name: {"size": VIEW_SIZE} | options}).observation(observation)
+    assert offline.keys() == view.outputs.keys()
+    for output, image in offline.items():
+        expected = image.transpose(2, 0, 1) / np.float32(255) if image.ndim == 3 else image[None]
+        made = online[keys.view("side", output)][0].numpy()
+        assert made.dtype == expected.dtype
+        np.testing.assert_array_equal(made, expected, err_msg=output)
+        assert made.any()
 
 
 def test_a_view_that_is_present_is_left_alone(observed):
