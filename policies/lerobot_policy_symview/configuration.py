@@ -219,6 +219,25 @@ class SymviewConfig(PreTrainedConfig):
         return {self.view: self.view_options | needless.get(self.view, {})}
 
     @property
+    def gripper_entries(self) -> list[int]:
+        """Which entries of the state are the gripper's x, y, z, yaw and aperture; none if no view is made with them.
+
+        Raises:
+            ValueError: if the view cannot be made without them and the state lacks some.
+        """
+        if not any(make_view(name, **options).needs_gripper for name, options in self.computed_views.items()):
+            return []
+        missing = [kind for kind in keys.STATE_NAMES if kind not in self.state_symmetry]
+        if missing:
+            raise ValueError(
+                f"--policy.view={self.view} is made with the gripper's {', '.join(keys.STATE_NAMES)}; "
+                f"--policy.state_symmetry={self.state_symmetry} lacks {missing}: make it without, by "
+                "--policy.view_options='{clip: none}' (reproj) or '{plane_height: 0}' (persp), and a dataset's views "
+                "by symview-add-views --reproj.clip=none or --persp.plane_height=0"
+            )
+        return [self.state_symmetry.index(kind) for kind in keys.STATE_NAMES]
+
+    @property
     def raw_keys(self) -> list[str]:
         """Features a camera must deliver for the policy to run."""
         if not self.is_computed:

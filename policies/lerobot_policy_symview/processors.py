@@ -17,7 +17,11 @@ def make_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's usual pipelines, with the policy's view computed where an observation lacks it."""
+    """Return LeRobot's usual pipelines, with the policy's view computed where an observation lacks it.
+
+    Raises:
+        ValueError: if that view needs the gripper's pose and the declared state has none.
+    """
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         input_steps=[
@@ -29,6 +33,7 @@ def make_processors(
                 camera=config.camera,
                 workspace=config.workspace,
                 calibration=config.calibration,
+                gripper=config.gripper_entries,
             ),
             steps.normalize,
         ],

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processors import make_processors
+from lerobot_symview import keys
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observation, Observed, Reset, Simulators, Step
 
@@ -59,7 +60,20 @@ def _as_delivered(values: Tensor) -> Tensor:
 
 
 def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
-    """Return what simulators of `env` must report for a policy to act."""
+    """Return what simulators of `env` must report for a policy to act.
+
+    Raises:
+        ValueError: if the state that the policy declares is not that of the simulators.
+    """
+    config.states.check(len(keys.STATE_NAMES), keys.STATE, keys.STATE_NAMES)
+    if any(
+        kind in keys.STATE_NAMES and kind != name
+        for kind, name in zip(config.state_symmetry, keys.STATE_NAMES, strict=True)
+    ):
+        raise ValueError(
+            f"--policy.state_symmetry={config.state_symmetry} puts entries where a simulator's state has others: "
+            f"it is {', '.join(keys.STATE_NAMES)}"
+        )
     return Observed(
         env=env,
         names=tuple(config.network_keys),

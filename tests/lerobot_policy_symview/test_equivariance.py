@@ -140,6 +140,7 @@ def test_another_robot_needs_only_another_declaration():
         action_symmetry=["aperture", "ry", "yaw", "y", "z", "x", "rx"],
         state_symmetry=["scalar", "y:wrist", "x:wrist", "z", "sign"],
         gripper_input="vector",
+        view_options={"clip": "none"},
     )
     take_training_steps(policy)
     assert_equivariant(policy)
@@ -147,6 +148,7 @@ def test_another_robot_needs_only_another_declaration():
         action_symmetry=["aperture", "ry", "yaw", "x", "z", "y", "rx"],
         state_symmetry=policy.config.state_symmetry,
         gripper_input="vector",
+        view_options={"clip": "none"},
     )
     wrong.load_state_dict(policy.state_dict())
     wrong.config.action_symmetry = policy.config.action_symmetry

@@ -7,13 +7,17 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres_of_depth, metres_of_heights
+from lerobot_policy_symview.processors import make_processors
+from lerobot_policy_symview.rollouts import observed as simulated
 from lerobot_symview import keys
 from lerobot_symview.camera import CalibrationError, depth_in_metres, stored_camera
 from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view
 from lerobot_symview.workspace import Workspace
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 from tests.conftest import VIEW_SIZE
+from tests.lerobot_policy_symview.policies import make_config
 
 OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
 
@@ -180,6 +184,41 @@ def test_the_step_is_rebuilt_from_its_configuration(observed):
     again = ViewsProcessorStep(**step.get_config())
     key = "observation.images.side_reproj"
     assert torch.equal(again.observation(dict(observed))[key], step.observation(dict(observed))[key])
+
+
+def reordered(observed):
+    """The same moment from a robot whose state has another order, and the declaration of that."""
+    kinds = ["aperture", "yaw", "scalar", "y", "z", "x"]
+    named = dict(zip(keys.STATE_NAMES, observed[keys.STATE][0], strict=True)) | {"scalar": torch.tensor(9.0)}
+    return observed | {keys.STATE: torch.stack([named[kind] for kind in kinds])[None]}, kinds
+
+
+@pytest.mark.parametrize("method", ["reproj_equi", "persp_equi"])
+def test_a_state_of_another_order_gives_the_same_view(observed, method):
+    state, kinds = reordered(observed)
+    options = {"plane_height": "gripper"} if method == "persp_equi" else {}
+    usual = make_config(method=method, view_options=options)
+    expected = make_processors(usual)[0](dict(observed))
+    config = make_config(method=method, view_options=options, state_symmetry=kinds)
+    seen = make_processors(config)[0](dict(state))
+    for key in filter(None, (config.color_key, config.height_key if method == "reproj_equi" else None)):
+        assert torch.equal(seen[key], expected[key]), key
+
+
+def test_a_view_that_needs_a_gripper_is_refused_where_the_state_has_none(observed):
+    options = {"state_symmetry": ["x", "y", "scalar", "sign", "scalar"], "gripper_input": "vector"}
+    with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* lacks \['z', 'yaw', 'aperture'\].*clip: none"):
+        make_processors(make_config(**options))
+    config = make_config(**options, view_options={"clip": "none"})
+    assert config.color_key in make_processors(config)[0](dict(observed))
+
+
+def test_simulators_are_refused_where_the_declared_state_is_not_theirs(observed):
+    _, kinds = reordered(observed)
+    assert simulated(make_config(), EnvSettings("block_picking")).names
+    kinds.remove("scalar")
+    with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* it is x, y, z, yaw, aperture"):
+        simulated(make_config(state_symmetry=kinds), EnvSettings("block_picking"))
 
 
 def test_missing_inputs_are_named(observed):
