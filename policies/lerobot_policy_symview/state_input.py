@@ -23,21 +23,21 @@ class StateInput:
 
     def __init__(self, config: SymviewConfig, workspace: Workspace):
         entries = config.state_symmetry
-        wanted = {"image": ("z", "aperture"), "vector": ("x", "y", "z", "aperture"), "none": ("aperture",)}
+        wanted = {"image": ("z", "aperture"), "vector": keys.STATE_NAMES, "none": ("aperture",)}
         roles = wanted[config.gripper_input]
+        entering = [i for i, entry in enumerate(entries) if entry in roles or entry not in keys.STATE_NAMES]
         self.symmetry = config.states
-        self.indices = [i for i, entry in enumerate(entries) if entry in roles or entry not in keys.STATE_NAMES]
+        self.yaws = [i for i in entering if entries[i].split(":")[0] == "yaw"]
+        self.indices = [i for i in entering if i not in self.yaws]
         half = workspace.size / 2
         units = {"x": half, "y": half, "z": workspace.height_limit, "aperture": 1.0}
         self.units = [units.get(entry) for entry in entries]
-        self.yaw = entries.index("yaw") if config.gripper_input == "vector" and "yaw" in entries else None
         self.camera_direction = config.camera_direction
 
     def representation(self, group: PlanarGroup) -> NDArray[np.float64]:
         """Return the matrices (G, D, D) that move the numbers."""
         blocks = [self.symmetry.select(self.indices).representation(group)] if self.indices else []
-        if self.yaw is not None:
-            blocks.append(group.rotation(frequency=2))
+        blocks += [group.rotation(frequency=2)] * len(self.yaws)
         if self.camera_direction:
             blocks.append(group.rotation())
         return block_diagonal(blocks) if blocks else np.zeros((group.size, 0, 0))
@@ -52,11 +52,11 @@ class StateInput:
     def __call__(self, state: Tensor, center: Tensor, width: Tensor, direction: Tensor | None) -> Tensor:
         """Return the numbers (B, D) of states (B, N), their range and directions to the camera (B, 2).
 
-        A parallel gripper looks the same after half a turn, so its yaw enters as (cos, sin) of twice the angle.
+        A parallel gripper looks the same after half a turn, so every yaw enters as (cos, sin) of twice the angle.
         """
         parts = [((state - center) / width)[:, self.indices]]
-        if self.yaw is not None:
-            twice = 2 * state[:, self.yaw]
+        for yaw in self.yaws:
+            twice = 2 * state[:, yaw]
             parts.append(torch.stack([torch.cos(twice), torch.sin(twice)], dim=-1))
         if self.camera_direction:
             assert direction is not None

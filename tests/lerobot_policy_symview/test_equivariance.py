@@ -156,6 +156,21 @@ def test_another_robot_needs_only_another_declaration():
         assert_equivariant(wrong)
 
 
+@pytest.mark.parametrize(
+    ("state", "gripper_input"),
+    [
+        (["x:left", "y:left", "z:left", "yaw:left", "scalar"], "vector"),
+        (["x", "y", "z", "yaw", "aperture", "yaw:r"], "vector"),
+        (["x", "y", "z", "yaw", "aperture", "yaw:r"], "image"),
+    ],
+)
+def test_every_orientation_in_the_state_turns_along(state, gripper_input):
+    options = {"view_options": {"clip": "none"}, "gripper_input": gripper_input}
+    policy = make_policy(state_symmetry=state, **options)
+    take_training_steps(policy)
+    assert_equivariant(policy)
+
+
 def test_an_observation_is_moved_and_moved_back():
     config = make_config(method="reproj_equi_broken")
     group = checked_group(config)
