@@ -23,17 +23,22 @@ def random_motion(augmentation: str, like: Tensor) -> Motion:
 
 
 def move_images(images: Tensor, motion: Motion) -> Tensor:
-    """Move top-down images (B, C, H, H) as the scene moves; edges are extended.
+    """Move the middle squares of images (B, C, H, W) as the scene moves; edges are extended.
 
     A quarter turn equals `torch.rot90(images, 1, (-2, -1))` and a mirror image `images.flip(-1)`, by DESIGN's pixel
-    convention: rows grow with x, columns with y.
+    convention: rows grow with x, columns with y. It is computed in the images' precision under autocast too.
+
+    Returns:
+        (B, C, S, S), S the shorter of H and W.
     """
+    images = crop(images, min(images.shape[-2:]))  # a turned oblong would be stretched to fit
     cos, sin, sign = torch.cos(motion.angle), torch.sin(motion.angle), motion.sign
     zero = torch.zeros_like(cos)
     # grid_sample asks where an output pixel (column, row) is read: at the inverse motion of its place (y, x)
     theta = torch.stack([torch.stack([sign * cos, -sign * sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
-    grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
-    return functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    with torch.autocast(images.device.type, enabled=False):  # its bfloat16 cannot tell a pixel from the next
+        grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
+        return functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 
 
 def scale_down(images: Tensor, size: int) -> Tensor:

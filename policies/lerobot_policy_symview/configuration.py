@@ -284,11 +284,12 @@ class SymviewConfig(PreTrainedConfig):
                 f"--policy.view={self.view} needs {self.raw_keys} or {self.color_key!r}; "
                 f"the dataset has {sorted(key for key in features if 'images' in key)}"
             )
-        size = features[self.color_key]["shape"][0] if self.color_key in features else self._made_view().size
+        is_recorded = self.color_key in features
+        size = min(features[self.color_key]["shape"][:2]) if is_recorded else self._made_view().size
         if size < self.crop_size and self.encoder not in LIFTING:
             raise ValueError(
-                f"--policy.crop_size={self.crop_size} is larger than the {size} px view {self.color_key!r}: "
-                "lower it or make larger views"
+                f"--policy.crop_size={self.crop_size} is larger than the {size} px of the shorter side of "
+                f"{self.color_key!r}: lower it or make larger views"
             )
         visuals = list(self.raw_keys)
         if not has_raw:

@@ -27,6 +27,21 @@ def test_images_of_a_batch_move_by_their_own_motions():
     torch.testing.assert_close(moved[1], IMAGES[1].flip((-2, -1)))
 
 
+def test_autocast_does_not_lower_the_precision_of_motions():
+    images = torch.rand(2, 3, 76, 76, generator=torch.Generator().manual_seed(0))
+    motion = Motion.of_element(make_group("D4"), 1, images.flatten(1))
+    with torch.autocast("cpu", torch.bfloat16):
+        moved = move_images(images, motion)
+    torch.testing.assert_close(moved, torch.rot90(images, 1, (-2, -1)), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("element", range(8))
+def test_of_oblong_images_the_middle_square_moves(element):
+    group, oblong = make_group("D4"), torch.nn.functional.pad(IMAGES, (5, 3))
+    moved = move_images(oblong, Motion.of_element(group, element, IMAGES.flatten(1)))
+    torch.testing.assert_close(moved, move_images(oblong[..., 4:16], Motion.of_element(group, element, IMAGES)))
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("angle", [0.3, 1.9, 4.0])
 def test_a_moved_picture_shows_the_moved_gripper(angle, mirrored):

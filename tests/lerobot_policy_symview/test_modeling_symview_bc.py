@@ -171,6 +171,15 @@ def test_impossible_configurations_are_refused_by_their_flag(options, message):
         SymviewBcConfig(device="cpu", **options)
 
 
+@pytest.mark.parametrize("shape", [(60, 152), (152, 60)])
+def test_images_must_be_as_large_as_the_crop_both_ways(shape):
+    config = SymviewBcConfig(device="cpu", method="sideview_equi", modality="rgb", crop_size=64)
+    numbers = {"dtype": "float32", "shape": (5,), "names": None}
+    image = {"dtype": "image", "shape": (*shape, 3), "names": None}
+    with pytest.raises(ValueError, match=r"--policy\.crop_size=64 is larger than the 60 px"):
+        config.set_dataset_feature_metadata({keys.STATE: numbers, keys.ACTION: numbers, keys.rgb("side"): image})
+
+
 def test_reduced_precision_acts_nearly_alike():
     policy = make_policy()
     expected = act(policy, example_observation(policy.config))
