@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -92,12 +92,22 @@ class FieldLayer(nn.Module):
         self.bias = nn.Parameter(torch.zeros(fields))
         self._kept: tuple[Any, tuple[Tensor, ...]] | None = None
 
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation, which forgets what was kept."""
+        if mode != self.training:
+            self._kept = None
+        return super().train(mode)
+
     def expanded(self) -> tuple[Tensor, ...]:
         """Return ordinary weights (G fields, channels, layers, taps) and biases (G fields,)."""
         return self.kept(self._expand)
 
     def kept(self, compute: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """Return what is computed from the weights; outside of training it is kept until these change."""
+        """Return what is computed from the weights; without gradients it is kept until these change.
+
+        PyTorch does not count changes through `parameter.data`: they are seen after the next switch between `train()`
+        and `eval()`.
+        """
         if torch.is_grad_enabled():
             self._kept = None
             return compute()

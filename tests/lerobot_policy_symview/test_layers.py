@@ -127,6 +127,17 @@ def test_expanded_filters_are_kept_until_weights_change():
     assert layer.expanded()[0].requires_grad
 
 
+def test_a_switch_to_evaluation_sees_weights_that_were_swapped_unnoticed():
+    """As libraries do that average weights: through `.data`, which raises no version."""
+    layer, images = FieldConv2d(D4, 2, 2, 1).eval(), torch.randn(1, 16, 6, 6)
+    with torch.no_grad():
+        kept = layer.eval().expanded()[0]
+        assert layer.eval().expanded()[0] is kept
+        before = layer(images)
+        layer.train().weight.data.mul_(2)
+        assert not torch.equal(layer.eval()(images), before)
+
+
 @pytest.mark.parametrize("channels", [5, 2])
 def test_our_encoder_computes_what_escnn_computes(channels):
     state = np.ones((8, 1, 1))
