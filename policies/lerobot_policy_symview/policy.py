@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from pathlib import Path
@@ -105,6 +105,14 @@ class SymviewPolicy(PreTrainedPolicy):
         policy = super().from_pretrained(pretrained_name_or_path, **options)
         check_processor_files(policy.config, str(pretrained_name_or_path), options)
         return policy
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Load weights; an average that they lack begins at the weights themselves."""
+        if self.averaged is not None and not any(name.startswith("averaged.") for name in state_dict):
+            trained = {name for name in state_dict if name.startswith("network.")}
+            begun = {name.replace("network.", "averaged.", 1): state_dict[name].clone() for name in trained}
+            state_dict = {**state_dict, **begun}
+        return super().load_state_dict(state_dict, strict, assign)
 
     @abstractmethod
     def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:

@@ -93,6 +93,16 @@ def test_averaged_weights_follow_the_trained_ones_and_act():
     torch.testing.assert_close(act(policy, example_observation(policy.config)), expected)
 
 
+def test_an_average_that_a_checkpoint_lacks_begins_at_its_weights(tmp_path):
+    policy = make_policy()
+    expected = act(policy, example_observation(policy.config))
+    policy.save_pretrained(tmp_path)
+    torch.manual_seed(1)
+    loaded = SymviewBcPolicy.from_pretrained(tmp_path, config=make_config(weight_averaging=0.9))
+    assert loaded.averaged is not None
+    torch.testing.assert_close(act(loaded, example_observation(loaded.config)), expected)
+
+
 def test_millimetres_and_metres_give_the_same_action():
     policy = make_policy()
     raw = example_observation(policy.config)
