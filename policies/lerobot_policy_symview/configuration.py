@@ -118,6 +118,12 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.width must be a multiple of 16 up to 1024, got {self.width}")
         if not 0 <= self.weight_averaging < 1:
             raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
+        for kind in ("STATE", "ACTION"):
+            if self.normalization_mapping.get(kind, NormalizationMode.IDENTITY) != NormalizationMode.IDENTITY:
+                raise ValueError(
+                    f"--policy.normalization_mapping must be IDENTITY for {kind}, got "
+                    f"{self.normalization_mapping[kind]}: the policy scales it by itself, as the symmetry demands"
+                )
         self._check_combination()
         _ = self.actions, self.states  # declarations are checked when they are parsed
 

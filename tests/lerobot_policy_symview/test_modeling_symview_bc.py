@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from lerobot.configs.types import NormalizationMode
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_symview.configuration import CHOICES, CROP_SIZES, ENCODER_NAMES
@@ -168,6 +169,11 @@ def test_the_head_has_the_papers_parameter_count():
         ({"width": 12}, "multiple of 16"),
         ({"crop_size": 100}, "expected one of: 64, 128"),
         ({"weight_averaging": 1.0}, "below 1"),
+        (
+            {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
+            "must be IDENTITY for ACTION, got .*MEAN_STD",
+        ),
+        ({"normalization_mapping": {"STATE": NormalizationMode.MIN_MAX}}, "must be IDENTITY for STATE"),
         ({"group": "C1"}, "the plain encoder has the group C1"),
         ({"method": "sideview_nonequi", "group": "D4"}, "the plain encoder has the group C1"),
         ({"method": "voxel_equi", "group": "D8"}, "use --policy.group=D4"),
