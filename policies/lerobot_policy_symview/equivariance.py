@@ -17,6 +17,7 @@ from torch.nn import functional
 from lerobot_policy_symview.augmentation import move_images
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
 from lerobot_policy_symview.groups import PlanarGroup, make_group
+from lerobot_policy_symview.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processors import make_processors
 from lerobot_policy_symview.symmetry import Motion
@@ -47,12 +48,12 @@ def assert_equivariant(
         observation: what an environment or dataset delivers, batched; by default `example_observation`.
         camera: whether the camera moves with the scene; by default it stays, except for policies that lift its image
             to points in space.
-        tolerance: of `equivariance_errors`; by default 1e-4 in float32, 1e-10 in float64, 0.05 under bf16 autocast.
+        tolerance: of `equivariance_errors`; by default 1e-4 in float32, 1e-10 in float64, 0.05 in bf16, whether by
+            autocast or by `--policy.dtype`.
     """
     if tolerance is None:
-        device = policy.action_center.device.type
-        reduced = torch.is_autocast_enabled(device)
-        tolerance = TOLERANCE[torch.get_autocast_dtype(device) if reduced else policy.action_center.dtype]
+        with policy.precision():
+            tolerance = TOLERANCE[autocast_dtype(policy.action_center)]
     errors = equivariance_errors(policy, processors, observation, camera)
     group = checked_group(policy.config)
     violations = [

@@ -110,6 +110,15 @@ def test_reduced_precision_is_equivariant_as_far_as_it_is_precise():
         assert_equivariant(policy)
 
 
+@pytest.mark.parametrize(
+    "method", [method for method in EQUIVARIANT if method not in ("voxel_equi", "point_cloud_equi")]
+)
+def test_policies_that_compute_in_bfloat16_are_held_to_its_precision(method):
+    policy = make_policy(method=method, dtype="bfloat16")
+    assert max(equivariance_errors(policy).values()) > 1e-4
+    assert_equivariant(policy)
+
+
 def test_scaling_x_and_y_apart_breaks_equivariance():
     policy = make_policy()
     policy.action_width[0] *= 2
