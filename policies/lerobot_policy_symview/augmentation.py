@@ -13,9 +13,8 @@ from lerobot_policy_symview.symmetry import Motion
 AUGMENTATIONS = {"d4": (4, True), "so2": (None, False), "o2": (None, True)}
 
 
-def random_motion(augmentation: str, like: Tensor) -> Motion:
-    """Draw one motion per sample of `like` (B, ...): quarter turns or any, with mirror images or without."""
-    turns, mirrors = AUGMENTATIONS[augmentation]
+def random_motion(turns: int | None, mirrors: bool, like: Tensor) -> Motion:
+    """Draw one motion per sample of `like` (B, ...): by multiples of 360 degrees / `turns` or any, mirrored or not."""
     angle = torch.rand(len(like), device=like.device, dtype=like.dtype)
     angle = 2 * math.pi * (angle if turns is None else (angle * turns).floor() / turns)
     mirrored = torch.rand(len(like), device=like.device) < (0.5 if mirrors else 0.0)

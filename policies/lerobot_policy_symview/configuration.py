@@ -29,7 +29,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "gripper_input": ("image", "vector", "none"),
     "crop_size": CROP_SIZES,
     "theta_representation": ("sign", "trivial"),
-    "augmentation": ("none", "d4", "so2", "o2"),
+    "augmentation": ("none", "d4", "so2", "o2", "group"),
     "dtype": ("float32", "bfloat16"),
 }
 EXTENSIBLE = {"view": "symview.views", "encoder": "symview.encoders"}  # by entry points of these groups
@@ -76,9 +76,9 @@ class SymviewConfig(PreTrainedConfig):
     """`sign`: yaw increments change sign in a mirror; `trivial`: the paper's text."""
     relaxation_weight: float = 1e-4
     """Weight in the loss of the differences that relaxed layers make between orientations (paper A.4)."""
-    augmentation: Literal["none", "d4", "so2", "o2"] = "none"
-    """Move each training sample, action included, by a random element: quarter turns and mirror images, any turn, or
-    any turn and mirror images.
+    augmentation: Literal["none", "d4", "so2", "o2", "group"] = "none"
+    """Move each training sample, action included, by a random element: quarter turns and mirror images, any turn, any
+    turn and mirror images, or what `group` has.
     """
     learning_rate: float = 1e-3
     """Of Adam."""
@@ -163,6 +163,22 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(
                 f"--policy.gripper_input=image draws the gripper's {', '.join(roles)}; --policy.state_symmetry="
                 f"{self.state_symmetry} lacks {missing}: use --policy.gripper_input=vector"
+            )
+        if self.augmentation != "none":
+            self._check_augmentation()
+
+    def _check_augmentation(self) -> None:
+        if self.augmentation == "group" and self.group == "C1":
+            raise ValueError(
+                "--policy.augmentation=group moves nothing with --policy.group=C1: "
+                "use --policy.augmentation=d4, so2 or o2"
+            )
+        has_yaw = any(entry.split(":")[0] == "yaw" for entry in self.state_symmetry)
+        if self.gripper_input == "none" or not has_yaw:
+            raise ValueError(
+                f"--policy.augmentation={self.augmentation} turns the gripper with the scene, but its yaw does not "
+                f"enter the network with --policy.gripper_input={self.gripper_input} and --policy.state_symmetry="
+                f"{self.state_symmetry}: let a yaw enter, or use --policy.augmentation=none"
             )
 
     @property

@@ -15,7 +15,7 @@ from lerobot_policy_symview.configuration import SymviewConfig
 class SymviewSacfdConfig(SymviewConfig):
     """Soft actor-critic from demonstrations (SACfD), on views. The defaults are the paper's."""
 
-    augmentation: Literal["none", "d4", "so2", "o2"] = "so2"
+    augmentation: Literal["none", "d4", "so2", "o2", "group"] = "so2"
     """Move each sampled transition by a random element: any turn, as the paper does when it stores one, quarter turns
     and mirror images, or any turn and mirror images.
     """

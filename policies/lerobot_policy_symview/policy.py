@@ -16,7 +16,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lerobot_policy_symview.augmentation import crop, move_images, random_motion, scale_down
+from lerobot_policy_symview.augmentation import AUGMENTATIONS, crop, move_images, random_motion, scale_down
 from lerobot_policy_symview.clouds import cloud_from_depth
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
 from lerobot_policy_symview.encoders import make_encoder
@@ -190,7 +190,11 @@ class SymviewPolicy(PreTrainedPolicy):
 
     def random_motion(self, like: Tensor) -> Motion | None:
         """Draw the motion by which `augmentation` moves each sample of `like` (B, ...); None if it moves none."""
-        return None if self.config.augmentation == "none" else random_motion(self.config.augmentation, like)
+        if self.config.augmentation == "none":
+            return None
+        group = make_group(self.config.group)
+        motions = AUGMENTATIONS | {"group": (group.turns, group.mirrors)}
+        return random_motion(*motions[self.config.augmentation], like)
 
     def network_input(
         self, batch: dict[str, Tensor], motion: Motion | None = None, place: Tensor | None = None

@@ -3,11 +3,12 @@ import math
 import pytest
 import torch
 
-from lerobot_policy_symview.augmentation import crop, move_images, random_motion, scale_down
+from lerobot_policy_symview.augmentation import AUGMENTATIONS, crop, move_images, random_motion, scale_down
 from lerobot_policy_symview.groups import make_group
 from lerobot_policy_symview.symmetry import Motion, Symmetry
 from lerobot_symview.gripper import gripper_image
 from lerobot_symview.workspace import Workspace
+from tests.lerobot_policy_symview.policies import make_policy
 
 IMAGES = torch.rand(2, 3, 12, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -57,13 +58,23 @@ def test_a_moved_picture_shows_the_moved_gripper(angle, mirrored):
 @pytest.mark.parametrize("augmentation", ["d4", "so2", "o2"])
 def test_random_motions_reach_all_they_may_and_nothing_else(augmentation):
     torch.manual_seed(0)
-    motion = random_motion(augmentation, torch.zeros(400, 5))
+    motion = random_motion(*AUGMENTATIONS[augmentation], torch.zeros(400, 5))
     quarters = motion.angle / (math.pi / 2)
     assert motion.mirrored.float().mean() == (0.0 if augmentation == "so2" else pytest.approx(0.5, abs=0.1))
     if augmentation == "d4":
         assert set(quarters.tolist()) == {0.0, 1.0, 2.0, 3.0}
     else:
         assert torch.histc(quarters, 8, 0, 4).min() > 25
+
+
+@pytest.mark.parametrize("group", ["C4", "D4", "C8", "D8"])
+def test_augmentation_by_the_group_draws_all_its_elements(group):
+    torch.manual_seed(0)
+    motion = make_policy(group=group, augmentation="group").random_motion(torch.zeros(400, 5))
+    elements = set(zip((motion.angle / (math.pi / 4)).round().tolist(), motion.mirrored.tolist(), strict=True))
+    expected = make_group(group)
+    angles = {round(expected.angle(element) / (math.pi / 4)) for element in range(expected.size)}
+    assert elements == {(angle, flip) for angle in angles for flip in ({False, True} if group[0] == "D" else {False})}
 
 
 def test_the_middle_commutes_with_quarter_turns():

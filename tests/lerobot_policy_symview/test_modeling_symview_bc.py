@@ -169,6 +169,12 @@ def test_the_head_has_the_papers_parameter_count():
         ({"width": 12}, "multiple of 16"),
         ({"crop_size": 100}, "expected one of: 64, 128"),
         ({"weight_averaging": 1.0}, "below 1"),
+        ({"augmentation": "group", "method": "sideview_nonequi"}, "group moves nothing with --policy.group=C1"),
+        ({"augmentation": "so2", "gripper_input": "none"}, "does not enter .*--policy.gripper_input=none"),
+        (
+            {"augmentation": "d4", "gripper_input": "vector", "state_symmetry": ["x", "y"]},
+            r"does not enter .*--policy.state_symmetry=\['x', 'y'\].* use --policy.augmentation=none",
+        ),
         (
             {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},
             "must be IDENTITY for ACTION, got .*MEAN_STD",
