@@ -135,6 +135,27 @@ def test_losses_can_be_weighed_sample_by_sample():
     assert output == {"asymmetry": 0.0}
 
 
+TRAINED = {
+    "reproj_equi": 1_113_098,
+    "persp_equi": 1_113_050,
+    "sideview_equi": 1_113_242,
+    "oracle_equi": 1_113_098,
+    "sideview_nonequi": 1_132_565,
+    "voxel_equi": 1_178_774,
+    "point_cloud_equi": 1_178_978,
+    "reproj_equi_relaxed": 1_669_354,
+    "persp_equi_relaxed": 1_669_282,
+    "reproj_equi_broken": 1_113_194,
+    "persp_equi_broken": 1_113_146,
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_policies_train_as_many_numbers_as_they_did(method):
+    """With the heads and the inputs that they are shipped with."""
+    assert SymviewBcPolicy(make_config(method=method, width=64, crop_size=128)).parameter_count == TRAINED[method]
+
+
 PARAMETERS = {
     "reproj_equi": 1_112_680,
     "sideview_nonequi": 1_130_560,
