@@ -46,8 +46,8 @@ def assert_equivariant(
         policy: what to check; its mode is left as it was.
         processors: its pre- and postprocessor; by default those that its configuration makes.
         observation: what an environment or dataset delivers, batched; by default `example_observation`.
-        camera: whether the camera moves with the scene; by default it stays, except for policies that lift its image
-            to points in space.
+        camera: whether the camera moves with the scene; by default it does where what it sees is made into the
+            policy's view or lifted to points in space, and stays where the view is there already.
         tolerance: of `equivariance_errors`; by default 1e-4 in float32, 1e-10 in float64, 0.05 in bf16, whether by
             autocast or by `--policy.dtype`.
     """
@@ -110,7 +110,10 @@ def move_observation(
     element: int,
     camera: Literal["stays", "moves"] | None = None,
 ) -> Observation:
-    """Return what is observed of the scene moved by an element about the workspace's centre."""
+    """Return what is observed of the scene moved by an element about the workspace's centre.
+
+    Arguments as for `assert_equivariant`; a camera that moves must be in the observation.
+    """
     moved = dict(observation)
     moved[keys.STATE] = config.states.move(
         observation[keys.STATE], Motion.of_element(group, element, observation[keys.STATE]), absolute_yaw=True
@@ -120,7 +123,8 @@ def move_observation(
         for key in filter(None, (config.color_key, config.height_key)):
             if key in observation:
                 moved[key] = _move_pixels(observation[key], group, element)
-    if camera == "moves" or (camera is None and lifted):
+    is_raw = config.is_computed and config.color_key not in observation
+    if camera == "moves" or (camera is None and (lifted or is_raw)):
         key = keys.world_from_cam(config.camera)
         pose = observation[key].double().view(-1, 4, 4).clone()
         center = pose.new_tensor([*parse_workspace(config.workspace).center, 0.0])
@@ -128,8 +132,20 @@ def move_observation(
         turn[:2, :2] = torch.from_numpy(group.rotation()[element])
         pose[:, :3, :3] = turn @ pose[:, :3, :3]  # a mirror image's camera axes are left-handed: so is what it sees
         pose[:, :3, 3] = (pose[:, :3, 3] - center) @ turn.T + center
+        if is_raw and group.flips(element):
+            moved |= _mirrored_image(observation, config)
+            pose[:, :3, 0] *= -1  # right-handed again, as views demand: the image is mirrored in its stead
         moved[key] = pose.flatten(1).to(observation[key].dtype)
     return moved
+
+
+def _mirrored_image(observation: Observation, config: SymviewConfig) -> Observation:
+    """Return a camera's images with their columns reversed, and the intrinsics of that."""
+    images = {key: observation[key].flip(-1) for key in config.raw_keys}
+    key = keys.intrinsics(config.camera)
+    k = observation[key].clone()
+    k[:, 2] = images[config.raw_keys[0]].shape[-1] - 1 - k[:, 2]
+    return images | {key: k}
 
 
 def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> Observation:

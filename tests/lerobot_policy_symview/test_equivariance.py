@@ -3,6 +3,7 @@
 import pytest
 import torch
 from lerobot.configs.types import NormalizationMode
+from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
@@ -18,6 +19,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_policy_symview.symmetry import Motion
 from lerobot_symview import keys
+from symview_sim.env import SymviewEnv
 from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch
 
 BROKEN = [method for method in METHODS if method.endswith("_broken")]
@@ -178,6 +180,38 @@ def test_every_orientation_in_the_state_turns_along(state, gripper_input):
     policy = make_policy(state_symmetry=state, **options)
     take_training_steps(policy)
     assert_equivariant(policy)
+
+
+@pytest.fixture(scope="module")
+def raw():
+    """What a simulator delivers, without views."""
+    env = SymviewEnv("block_picking")
+    observation, _ = env.reset(seed=3)
+    env.close()
+    batched = {
+        key: {name: image[None] for name, image in value.items()} if isinstance(value, dict) else value[None]
+        for key, value in observation.items()
+    }
+    return preprocess_observation(batched)
+
+
+# a mirror image changes which of equally high points a reprojected pixel shows, infill what lies between them
+@pytest.mark.parametrize(
+    ("method", "options", "turned", "mirrored"),
+    [
+        ("persp_equi", {}, 1e-4, 1e-4),
+        ("voxel_equi", {}, 1e-4, 1e-4),
+        ("reproj_equi", {"infill": "none"}, 1e-4, 0.1),
+        ("reproj_equi", {"infill": "nearest"}, 0.2, 0.2),
+    ],
+)
+def test_policies_turn_from_the_raw_image_on(raw, method, options, turned, mirrored):
+    policy = make_policy(method=method, view_options={"size": 76, **options})
+    take_training_steps(policy)
+    errors = equivariance_errors(policy, observation=raw)
+    assert max(errors[element] for element in (1, 2, 3)) < turned
+    assert max(errors[element] for element in (4, 5, 6, 7)) < mirrored
+    assert max(equivariance_errors(policy, observation=raw, camera="stays").values()) > max(turned, mirrored)
 
 
 def test_an_observation_is_moved_and_moved_back():
