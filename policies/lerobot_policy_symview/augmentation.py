@@ -61,7 +61,8 @@ def crop(images: Tensor, size: int, place: Tensor | None = None) -> Tensor:
     if place is None:
         top, left = (height - size) // 2, (width - size) // 2
         return images[..., top : top + size, left : left + size]
-    corner = (place * place.new_tensor([height - size + 1, width - size + 1])).long()
+    row, column = place.unbind(-1)
+    corner = torch.stack([row * (height - size + 1), column * (width - size + 1)], dim=-1).long()
     rows, columns = (corner[..., None] + torch.arange(size, device=corner.device)).unbind(dim=1)
     index = torch.arange(batch, device=corner.device)[:, None, None, None]
     every = torch.arange(channels, device=corner.device)[:, None, None]

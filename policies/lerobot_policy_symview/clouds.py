@@ -68,13 +68,14 @@ def cloud_from_depth(
     v = torch.arange(height, dtype=torch.float64, device=depth.device)[:, None].expand(height, width)
     u = torch.arange(width, dtype=torch.float64, device=depth.device)[None].expand(height, width)
     pixel = torch.stack([u, v, torch.ones_like(u)], dim=-1).view(-1, 3)
-    rays = pixel @ torch.linalg.inv(k).transpose(1, 2) @ pose[:, :3, :3].transpose(1, 2)
+    rays = pixel @ torch.linalg.inv_ex(k).inverse.transpose(1, 2) @ pose[:, :3, :3].transpose(1, 2)
     world = rays * distance.view(batch, -1, 1) + pose[:, None, :3, 3]
-    position = world - world.new_tensor([*workspace.center, 0.0])
+    x, y, z = world.unbind(-1)
+    position = torch.stack([x - workspace.center[0], y - workspace.center[1], z], dim=-1)
     half = workspace.size / 2
     valid = (distance > 0) & torch.isfinite(distance)
     valid = valid.flatten(1) & (position[..., :2].abs() < half).all(-1)
-    valid &= position[..., 2] < torch.minimum(ceiling.double(), ceiling.new_tensor(workspace.height_limit))[:, None]
+    valid &= position[..., 2] < ceiling.double().clamp(max=workspace.height_limit)[:, None]
     # points left out lie at the centre, so that no infinity reaches a network
     position = torch.where(valid[..., None], position, 0.0)
     return Cloud(position, rgb.flatten(2).transpose(1, 2), valid)

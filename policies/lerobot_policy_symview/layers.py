@@ -175,7 +175,7 @@ class RelaxedConv2d(FieldConv2d):
 
     def asymmetry(self) -> Tensor:
         """Return the sum of the differences between gains, which training keeps small."""
-        first, second = torch.triu_indices(len(self.gains), len(self.gains), 1).unbind()
+        first, second = torch.triu_indices(len(self.gains), len(self.gains), 1, device=self.gains.device).unbind()
         return (self.gains[first] - self.gains[second]).abs().sum()
 
 

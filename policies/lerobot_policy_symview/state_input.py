@@ -66,6 +66,6 @@ class StateInput:
 
 def camera_directions(world_from_cam: Tensor, workspace: Workspace) -> Tensor:
     """Return horizontal unit vectors (B, 2) from the workspace's centre to cameras with poses (B, 16)."""
-    position = world_from_cam.view(-1, 4, 4)[:, :2, 3]
-    offset = position - position.new_tensor(workspace.center)
+    x, y = world_from_cam.view(-1, 4, 4)[:, :2, 3].unbind(-1)
+    offset = torch.stack([x - workspace.center[0], y - workspace.center[1]], dim=-1)
     return offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
