@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -35,7 +36,7 @@ MARGIN = 24  # pixels that the random crop may choose among: the paper's 152 for
 
 @dataclass(frozen=True)
 class PolicyBenchmark:
-    """Training steps, inference, start and data loading of symview_bc on a CPU, as ratios of one run."""
+    """Training steps, inference, start and data loading of symview_bc, as ratios of one run."""
 
     batch_size: int = 128
     """Samples per training step."""
@@ -45,6 +46,10 @@ class PolicyBenchmark:
     """Pixels the network sees."""
     repeats: int = 3
     """Training steps of each network; medians are taken. Inference is repeated ten times as often."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Precision of convolutions, ours and the ordinary network's; escnn's are in float32."""
+    device: str = "cpu"
+    """What the networks run on, such as `cuda`; data is loaded by the processor."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -54,6 +59,12 @@ class PolicyBenchmark:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if self.crop_size not in CROP_SIZES:
             raise ValueError(f"--crop_size must be one of {CROP_SIZES}, got {self.crop_size}")
+        if self.dtype not in ("float32", "bfloat16"):
+            raise ValueError(f"--dtype must be float32 or bfloat16, got {self.dtype}")
+        try:
+            torch.empty(0, device=self.device)
+        except (AssertionError, RuntimeError) as error:
+            raise ValueError(f"--device={self.device} cannot be used here: {error}") from None
 
 
 class PlainNetwork(nn.Module):
@@ -79,6 +90,8 @@ class PlainNetwork(nn.Module):
         """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
         planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
         features = torch.cat([picture, planes], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as ours
+            features = features.contiguous(memory_format=torch.channels_last)
         for layer, pool in zip(self.layers, self.pooled, strict=True):
             features = layer(features)
             features = functional.relu(functional.max_pool2d(features, 2) if pool else features)
@@ -100,24 +113,28 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     construct = time.perf_counter() - start
     encoder = policy.network.encoder
     assert isinstance(encoder, ImageEncoder)
-    plain, escnn = PlainNetwork(encoder), EscnnEncoder(encoder, initialize=False)
+    plain = PlainNetwork(encoder).to(config.device)
+    escnn = EscnnEncoder(encoder, initialize=False).to(config.device)
     for parameter in escnn.parameters():
         nn.init.normal_(parameter, std=0.02)
     networks: dict[str, nn.Module] = {"": encoder, "plain_": plain, "escnn_": escnn}
     picture, state = _input(config, policy, config.batch_size)
-    steps = _medians(
-        {name: _training_step(network, picture, state) for name, network in networks.items()}, config.repeats, "step"
-    )
+    reduced = config.dtype == "bfloat16"
+    calls = {
+        name: _training_step(network, picture, state, reduced and name != "escnn_")
+        for name, network in networks.items()
+    }
+    steps = _medians(calls, config.repeats, "step")
     results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
     results |= {
         "train_step_ratio_escnn_fp32": steps[""] / steps["escnn_"],
         "train_step_ratio_plain": steps[""] / steps["plain_"],
-        "train_step_floor_s": _dense_operations(plain, config) / _operations_per_second(),
+        "train_step_floor_s": _dense_operations(plain, config) / _operations_per_second(config),
     }
     networks = {"": encoder, "plain_": plain}
     for batch in (1, 5):
         seen = _input(config, policy, batch)
-        calls = {name: _inference(network.eval(), *seen) for name, network in networks.items()}
+        calls = {name: _inference(network.eval(), *seen, reduced) for name, network in networks.items()}
         times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
         results |= {
             f"inference_ms_b{batch}": 1000 * times[""],
@@ -133,34 +150,39 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
 
 
 def _policy(config: PolicyBenchmark) -> SymviewBcPolicy:
-    settings = SymviewBcConfig(device="cpu", width=config.width, crop_size=config.crop_size)
+    settings = SymviewBcConfig(device=config.device, width=config.width, crop_size=config.crop_size)
     settings.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),))}
-    return SymviewBcPolicy(settings)
+    return SymviewBcPolicy(settings).to(config.device)
 
 
 def _input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
     size = config.crop_size
     picture = torch.rand(batch, policy.config.channels, size, size, generator=generator)
-    return picture, torch.rand(batch, 2, generator=generator)
+    return picture.to(config.device), torch.rand(batch, 2, generator=generator).to(config.device)
 
 
-def _training_step(network: nn.Module, picture: Tensor, state: Tensor) -> Callable[[], None]:
-    """Return a training step: least squares on the features, which any head costs next to nothing beside."""
+def _training_step(network: nn.Module, picture: Tensor, state: Tensor, reduced: bool) -> Callable[[], None]:
+    """Return a training step: least squares on the features, which any head costs next to nothing beside.
+
+    `reduced` computes convolutions in bfloat16.
+    """
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-5)
 
     def step() -> None:
         network.train()
-        network(picture, state).square().mean().backward()
+        with torch.autocast(picture.device.type, torch.bfloat16, enabled=reduced):
+            features = network(picture, state)
+        features.float().square().mean().backward()
         optimizer.step()
         optimizer.zero_grad()
 
     return step
 
 
-def _inference(network: nn.Module, picture: Tensor, state: Tensor) -> Callable[[], None]:
+def _inference(network: nn.Module, picture: Tensor, state: Tensor, reduced: bool) -> Callable[[], None]:
     def run() -> None:
-        with torch.inference_mode():
+        with torch.inference_mode(), torch.autocast(picture.device.type, torch.bfloat16, enabled=reduced):
             network(picture, state)
 
     return run
@@ -171,11 +193,19 @@ def _medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str)
     times: dict[str, list[float]] = {key: [] for key in calls}
     for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
         for key, call in calls.items():
+            _finish()
             start = time.perf_counter()
             call()
+            _finish()
             if repeat:
                 times[key].append(time.perf_counter() - start)
     return {key: statistics.median(values) for key, values in times.items()}
+
+
+def _finish() -> None:
+    """Wait for a GPU, if there is one: calls return before it is done."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
 
 
 def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
@@ -189,9 +219,9 @@ def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
     return total * config.batch_size
 
 
-def _operations_per_second(size: int = 1024, repeats: int = 5) -> float:
-    """Measure matrix products, the fastest arithmetic there is here."""
-    a, b = torch.rand(size, size), torch.rand(size, size)
+def _operations_per_second(config: PolicyBenchmark, size: int = 1024, repeats: int = 5) -> float:
+    """Measure matrix products, the fastest arithmetic there is."""
+    a, b = torch.rand(2, size, size, device=config.device, dtype=getattr(torch, config.dtype))
     return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
 
 

@@ -3,6 +3,8 @@ import json
 import pytest
 import torch
 
+from lerobot_policy_symview.encoders import ConvolutionalEncoder
+from lerobot_policy_symview.escnn_reference import EscnnEncoder
 from symview_eval import benchmark, policy_benchmark, rl_benchmark, views_benchmark
 
 
@@ -113,6 +115,35 @@ def test_the_network_it_is_compared_with_computes_the_same():
     seen = policy_benchmark._input(config, policy, 3)
     plain = policy_benchmark.PlainNetwork(policy.network.encoder)
     torch.testing.assert_close(plain(*seen), policy.network.encoder(*seen).flatten(1), rtol=1e-4, atol=1e-4)
+
+
+def test_policies_are_measured_in_bfloat16(monkeypatch):
+    """escnn's network is left in float32; what does not depend on the precision is not measured here."""
+    monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
+    monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
+    computed = {}
+    for kind in (policy_benchmark.PlainNetwork, ConvolutionalEncoder, EscnnEncoder):
+        forward = kind.forward
+
+        def noted(self, *seen, kind=kind, forward=forward):
+            result = forward(self, *seen)
+            computed.setdefault(kind.__name__, set()).add(result.dtype)
+            return result
+
+        monkeypatch.setattr(kind, "forward", noted)
+    config = policy_benchmark.PolicyBenchmark(batch_size=2, width=16, crop_size=64, repeats=1, dtype="bfloat16")
+    assert all(value > 0 for value in policy_benchmark.benchmark_policy(config).values())
+    assert computed == {
+        "PlainNetwork": {torch.bfloat16},
+        "ConvolutionalEncoder": {torch.bfloat16},
+        "EscnnEncoder": {torch.float32},
+    }
+
+
+@pytest.mark.parametrize(("option", "value"), [("dtype", "float16"), ("device", "cuda:99"), ("device", "abacus")])
+def test_a_precision_or_device_that_is_not_there_is_refused(option, value):
+    with pytest.raises(ValueError, match=f"--{option}.*{value}"):
+        policy_benchmark.PolicyBenchmark(**{option: value})
 
 
 def test_batches_are_measured_on_any_device():
