@@ -8,6 +8,7 @@ it should, and go the wrong way in a mirror image: the errors tell in which moti
 
 import argparse
 import logging
+from typing import Any
 
 import torch
 
@@ -23,11 +24,10 @@ WRONG = ACTION | {"roll": "x:tool", "pitch": "y:tool"}
 
 def make_policy(actions: dict[str, str], width: int) -> SymviewBcPolicy:
     """Return an untrained policy for a dataset of this robot."""
-    declared = {"state_symmetry": list(STATE.values()), "action_symmetry": list(actions.values())}
+    declared: dict[str, Any] = {"state_symmetry": list(STATE.values()), "action_symmetry": list(actions.values())}
     # `vector` gives the network the state's numbers; the default draws a gripper whose yaw this state does not tell.
-    config = SymviewBcConfig(
-        device="cpu", camera="front", width=width, crop_size=64, gripper_input="vector", **declared
-    )
+    declared |= {"gripper_input": "vector", "view_options": {"clip": "none"}}  # nor can a view be clipped by its pose
+    config = SymviewBcConfig(device="cpu", camera="front", width=width, crop_size=64, **declared)
     features = {
         "observation.images.front": {"dtype": "image", "shape": (480, 640, 3)},
         "observation.images.front_depth": {"dtype": "image", "shape": (480, 640, 1)},
