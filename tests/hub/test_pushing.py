@@ -9,17 +9,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from huggingface_hub import DatasetCard, ModelCard
+from huggingface_hub import DatasetCard, ModelCard, create_repo, upload_folder
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
-from lerobot.scripts import lerobot_eval
+from lerobot.scripts import lerobot_eval, lerobot_train
 
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.cli import CommandError
 from lerobot_symview.hub import PushedDataset, push_dataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
+from tests.conftest import VIEW_SIZE
 from tests.hub.client import online
 from tests.hub.server import ALICE, BOB, HubServer
 from tests.lerobot_policy_symview.test_training import train
@@ -142,3 +145,38 @@ def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
         done = subprocess.run(command, env=os.environ | hub.environment(ALICE) | home, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr[-2000:]
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_a_stock_policy_brings_its_view_along_to_another_process(recorded, tmp_path, monkeypatch):
+    """ACT, trained on a view, with our step in its preprocessing: who has the plugin evaluates it from the Hub."""
+    config = AddViewsConfig(
+        PushedDataset("test/recorded", recorded),
+        new_root=tmp_path / "stock",
+        views=["reproj"],
+        size=VIEW_SIZE,
+        for_stock_policies=True,
+    )
+    arguments = ["lerobot-train", "--dataset.repo_id=test/stock", f"--dataset.root={add_views(config)}"]
+    arguments += ["--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.dim_model=32"]
+    arguments += ["--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.pretrained_backbone_weights=null"]
+    arguments += ["--steps=1", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={tmp_path}/act"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    lerobot_train.main()
+    checkpoint = tmp_path / "act" / "checkpoints" / "last" / "pretrained_model"
+    preprocessor = make_pre_post_processors(PreTrainedConfig.from_pretrained(checkpoint), str(checkpoint))[0]
+    step = ViewsProcessorStep(views={"reproj": {"size": VIEW_SIZE, "height": False}})
+    preprocessor.steps.insert(-1, step)  # before the normalisation
+    preprocessor.save_pretrained(checkpoint)
+    same_name = json.dumps({"observation.images.side": "observation.images.side"})
+    evaluation = ["--env.type=symview", "--env.max_steps=2", "--eval.n_episodes=1", "--eval.batch_size=1"]
+    evaluation += ["--policy.device=cpu", f"--rename_map={same_name}", f"--output_dir={tmp_path / 'eval'}"]
+    with HubServer() as hub:
+        with online(hub, ALICE):
+            create_repo("alice/act")
+            upload_folder(repo_id="alice/act", folder_path=checkpoint)
+        program = shutil.which("lerobot-eval", path=os.path.dirname(sys.executable))
+        home = {"HF_HOME": str(tmp_path / "home"), "HF_LEROBOT_HOME": str(tmp_path / "home" / "lerobot")}
+        command = [program, "--policy.path=alice/act", *evaluation]
+        done = subprocess.run(command, env=os.environ | hub.environment(ALICE) | home, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
