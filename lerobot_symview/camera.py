@@ -159,7 +159,7 @@ def orbit_pose(elevation: float, azimuth: float, distance: float, target: ArrayL
 
 
 def invert_rigid(a_from_b: Array) -> Array:
-    """Return b_from_a (4, 4) for a rigid a_from_b (4, 4)."""
+    """Return b_from_a (4, 4) float64 for a rigid a_from_b (4, 4), metres: R^T and -R^T t, exact up to rounding."""
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = a_from_b[:3, :3].T
     b_from_a[:3, 3] = -a_from_b[:3, :3].T @ a_from_b[:3, 3]
@@ -167,7 +167,7 @@ def invert_rigid(a_from_b: Array) -> Array:
 
 
 def transform(a_from_b: Array, points_b: Array) -> Array:
-    """Map points (..., 3) from frame b to frame a with a rigid (4, 4)."""
+    """Map points (..., 3) from frame b to frame a with a rigid (4, 4): R p + t; float64, both in metres."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
@@ -196,9 +196,15 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
 
 
 def project(points_world: Array, camera: Camera) -> tuple[Array, Array]:
-    """Project world points (..., 3) to pixels (..., 2) as (u, v), and their depth (...) in metres.
+    """Project world points to pixels: y = K (R x + t), divided by its last entry (paper section 4.2).
 
-    Points with depth <= 0 lie behind the camera; their pixels are not meaningful.
+    Args:
+        points_world: (..., 3), metres.
+        camera: its calibration.
+
+    Returns:
+        (..., 2) float64 pixels (u, v), integers at pixel centres, and (...) float64 depth along the optical axis,
+        metres. Points with depth <= 0 lie behind the camera; their pixels are not meaningful, and not finite at 0.
     """
     points_cam = transform(camera.cam_from_world, np.asarray(points_world, dtype=np.float64))
     depth = points_cam[..., 2]

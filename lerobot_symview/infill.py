@@ -13,7 +13,7 @@ NEAR = 2  # columns
 
 
 def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Find the nearest known pixel of every pixel, by Euclidean distance.
+    """Find the nearest known pixel of every pixel, by Euclidean distance (paper A.5).
 
     Args:
         known: (H, W) bool.

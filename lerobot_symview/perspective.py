@@ -71,7 +71,15 @@ def warp_map(camera: Camera, workspace: Workspace, pixels: int, plane_height: fl
 
 
 def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: WarpMap) -> NDArray[np.uint8]:
-    """Sample `rgb` (H, W, 3) where `warp_map` says; (pixels, pixels, 3) uint8, bilinear, black outside the image."""
+    """Warp a plane to lie flat (paper section 4.2).
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        image_from_topdown: what `warp_map` returned for its camera.
+
+    Returns:
+        (pixels, pixels, 3) uint8, bilinear, black where the plane lies outside the image.
+    """
     return np.asarray(cv2.remap(rgb, *image_from_topdown, cv2.INTER_LINEAR), dtype=np.uint8)
 
 

@@ -41,7 +41,7 @@ def zbuffer_from_points(points: Array, workspace: Workspace, pixels: int, ceilin
         ceiling: metres above the table; what is higher is left out.
 
     Returns:
-        A buffer whose source is the index of the point.
+        A buffer whose source is the index of the point. Points outside the workspace's square are nowhere.
     """
     buffer = _cleared(pixels)
     rows_columns = workspace.pixel_from_xy(points[:, :2], pixels) + 0.5
@@ -110,7 +110,8 @@ def _cleared(pixels: int) -> ZBuffer:
 def grid_from_pixel(camera: Camera, workspace: Workspace, pixels: int) -> tuple[Array, Array]:
     """Return A (3, 3) and b (3,): pixel (u, v) at depth d lies at d A (u, v, 1) + b in (row, column, height).
 
-    Rows and columns count from the grid's edge, in cells; heights are metres.
+    This is paper Eq. 2-6 in one, as float64. Pixels are integers at their centres, depth is in metres along the optical
+    axis; rows and columns count from the grid's edge, in cells; heights are metres above the table.
     """
     scale = np.array([pixels / workspace.size, pixels / workspace.size, 1.0])
     rays = camera.world_from_cam[:3, :3] @ np.linalg.inv(camera.intrinsics)
