@@ -16,7 +16,7 @@ from tests.packages import install
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 README = ROOT / "README.md"
-SHELL_ONLY = {"make", "source", "python", "python3"}
+SHELL_ONLY = {"make", "source", "python", "python3", "python3.12"}
 """Programs that are neither ours nor LeRobot's, or set up what a test has already."""
 TRAINING = {"--steps": 2, "--batch_size": 2, "--policy.device": "cpu"}
 NETWORK = {"--policy.width": 16, "--policy.crop_size": 64}
