@@ -214,7 +214,8 @@ class EpisodeTables:
         self._dataset = dataset
         self._columns = columns
         self._file = pq.ParquetFile(file)
-        groups = [self._file.metadata.row_group(group) for group in range(self._file.num_row_groups)]
+        metadata = self._file.metadata
+        groups = [metadata.row_group(group) for group in range(metadata.num_row_groups)]
         images = [feature["shape"] for feature in dataset.features.values() if feature["dtype"] == "image"]
         row_bytes = ROW_BYTES + sum(8 * pixels(shape) for shape in images)
         largest = max((group.total_byte_size / max(group.num_rows, 1) for group in groups), default=0)

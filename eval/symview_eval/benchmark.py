@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,6 @@ from tqdm import tqdm
 
 from lerobot_symview.cli import run_command, subcommand
 from symview_eval.clock import Clock
-from symview_eval.experiment_benchmark import ExperimentBenchmark, benchmark_experiment
-from symview_eval.policy_benchmark import PolicyBenchmark, benchmark_policy
-from symview_eval.rl_benchmark import RlBenchmark, benchmark_rl
-from symview_eval.views_benchmark import ViewsBenchmark, benchmark_views
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.tasks import TASK_NAMES, check_task
@@ -185,19 +182,22 @@ def _print(results: dict[str, Any], as_json: bool) -> None:
         sys.stdout.write(f"{name:28}{cells}\n")
 
 
-SUITES: dict[str, tuple[type[Any], Callable[[Any], dict[str, Any]]]] = {
-    "experts": (ExpertsBenchmark, benchmark_experts),
-    "env": (EnvBenchmark, benchmark_env),
-    "views": (ViewsBenchmark, benchmark_views),
-    "policy": (PolicyBenchmark, benchmark_policy),
-    "rl": (RlBenchmark, benchmark_rl),
-    "experiment": (ExperimentBenchmark, benchmark_experiment),
+SUITES = {
+    "experts": ("symview_eval.benchmark", "ExpertsBenchmark", "benchmark_experts"),
+    "env": ("symview_eval.benchmark", "EnvBenchmark", "benchmark_env"),
+    "views": ("symview_eval.views_benchmark", "ViewsBenchmark", "benchmark_views"),
+    "policy": ("symview_eval.policy_benchmark", "PolicyBenchmark", "benchmark_policy"),
+    "rl": ("symview_eval.rl_benchmark", "RlBenchmark", "benchmark_rl"),
+    "experiment": ("symview_eval.experiment_benchmark", "ExperimentBenchmark", "benchmark_experiment"),
 }
+"""Name -> module, configuration and function. Loaded when asked for: worker processes import this module, and PyTorch
+takes longer than their work."""
 
 
 def main() -> None:
     """Run the console command: the first argument names the suite."""
-    config_class, measure = SUITES[subcommand("suite", SUITES, default="experts")]
+    module, *names = SUITES[subcommand("suite", SUITES, default="experts")]
+    config_class, measure = (getattr(import_module(module), name) for name in names)
     sys.argv = [
         argument.replace("--json", "--json=true") if argument == "--json" else argument for argument in sys.argv
     ]
