@@ -63,7 +63,7 @@ def metres_of_heights(heights: Tensor) -> Tensor:
 
 
 def _from_millimetres(lengths: Tensor) -> Tensor:
-    # By a plain number a GPU multiplies with the rounded reciprocal, which gives other bits.
+    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which gives other bits.
     return lengths / lengths.new_full((), MILLIMETRES_PER_METRE)
 
 

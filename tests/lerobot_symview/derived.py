@@ -1,4 +1,7 @@
-"""Requests for views of a dataset, and what a folder holds."""
+"""Requests for views of a dataset, what a folder holds, and the images of a dataset."""
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview.add_views import AddViewsConfig
 from lerobot_symview.hub import PushedDataset
@@ -12,3 +15,8 @@ def views_config(source, target, **options):
 
 def contents(folder):
     return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def images_of(folder, key):
+    dataset = LeRobotDataset("test/images", root=folder, depth_output_unit="m", video_backend="pyav")
+    return np.stack([dataset[i][key].numpy() for i in range(len(dataset))])
