@@ -40,4 +40,11 @@ def in_threads[State, Task](
                 work(state, task)
             return state
 
-    return [run(0)] if count == 1 else list(_workers(count).map(run, range(count)))
+    if count == 1:
+        return [run(0)]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # MKL has one number for all threads: with more, every product would start threads again
+    try:
+        return list(_workers(count).map(run, range(count)))
+    finally:
+        torch.set_num_threads(threads)

@@ -3,6 +3,7 @@
 import copy
 import multiprocessing
 import pickle
+import re
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 
@@ -201,6 +202,18 @@ def test_forked_processes_have_threads_of_their_own():
     with multiprocessing.get_context("fork").Pool(1) as pool:
         found = pool.apply_async(square_in_threads).get(timeout=60)
     assert sorted(chain.from_iterable(found)) == [0, 1, 4, 9]
+
+
+@pytest.mark.skipif(not torch.backends.mkl.is_available(), reason="this PyTorch has no MKL")
+def test_products_in_a_thread_start_no_others():
+    """MKL's number of threads is the process's: with two of ours it had four on two cores."""
+    found = in_threads(lambda found, _: found.append(mkl_threads()), range(2), list)
+    assert found == [["1"], ["1"]]
+    assert mkl_threads() == "2"
+
+
+def mkl_threads():
+    return re.search(r"mkl_get_max_threads\(\) : (\d+)", torch.__config__.parallel_info()).group(1)
 
 
 def square_in_threads():
