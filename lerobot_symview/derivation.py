@@ -21,12 +21,13 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.calibration import Calibration
 from lerobot_symview.features import Features
 from lerobot_symview.image_codec import encode_metres, encode_rgb
-from lerobot_symview.image_statistics import ImageStatistics, constant_summary
+from lerobot_symview.image_statistics import ImageStatistics, constant_summary, image_summary
 from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset
 from lerobot_symview.staging import disk_errors, part_of
 from lerobot_symview.views import View
@@ -141,7 +142,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     if table_file.exists():
         return count
     merged = derivation.no_statistics()
-    summaries = {}
+    summaries: dict[str, list[NDArray]] = {key: [] for key in merged}
     reader = derivation.reader(source)
     kept = [name for name in derivation.schema.names if name not in derivation.added]
     columns = list(dict.fromkeys([*kept, *reader.columns()]))
@@ -157,11 +158,11 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
                     arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
                     # a row group per episode, as LeRobot writes them
                     writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
-                    summaries[episode] = {key: one.summary() for key, one in statistics.items()}
                     for key, one in statistics.items():
+                        summaries[key].append(one.summary())
                         merged[key].merge(one)
             with statistics_part.open("wb") as stream:
-                np.savez_compressed(stream, **_packed(merged), summaries=np.array(json.dumps(summaries)))
+                np.savez_compressed(stream, **_packed(merged, summaries))
             for done, file in ((statistics_part, statistics_file), (table_part, table_file)):
                 file.parent.mkdir(parents=True, exist_ok=True)
                 done.replace(file)
@@ -207,10 +208,11 @@ def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
     return {key(derivation.camera): matrix.astype(np.float32).ravel() for key, matrix in matrices.items()}
 
 
-def _packed(merged: dict[str, ImageStatistics]) -> dict[str, Any]:
+def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
     packed: dict[str, Any] = {}
     for key, one in merged.items():
         packed |= {f"{key}/images": one.images, f"{key}/counts": one.counts, f"{key}/sums": one.sums}
+        packed[f"{key}/summaries"] = np.stack(summaries[key])
     return packed
 
 
@@ -225,9 +227,9 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
         if meta.exists():
             shutil.rmtree(meta)
         shutil.copytree(source.folder / "meta", meta)
-        totals, summaries = _collect_statistics(derivation, source, parts)
+        totals, of_episodes = _collect_statistics(derivation, source, parts)
         for file in sorted((meta / "episodes").rglob("*.parquet")):
-            _rewrite_episodes(file, derivation, source, parts, summaries)
+            _rewrite_episodes(file, derivation, source, parts, of_episodes)
         info = dict(source.info)
         kept = {key: feature for key, feature in source.features.items() if key not in derivation.dropped}
         info["features"] = kept | derivation.added
@@ -243,26 +245,32 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
 
 def _collect_statistics(
     derivation: Derivation, source: SourceDataset, parts: list[range]
-) -> tuple[dict[str, Any], dict[int, dict[str, Any]]]:
-    """Return the statistics of every new feature over the dataset, and over each episode."""
+) -> tuple[dict[str, Any], dict[str, dict[str, list[Any]]]]:
+    """Return the statistics of every new feature over the dataset, and lists of them over each episode."""
     totals = derivation.no_statistics()
-    summaries: dict[int, dict[str, Any]] = {}
+    summaries: dict[str, list[NDArray]] = {key: [] for key in totals}
     for part in range(len(parts)):
         with np.load(derivation.statistics_file(part)) as content:
             for key, total in totals.items():
                 images, counts, sums = (content[f"{key}/{name}"] for name in ("images", "counts", "sums"))
                 total.merge(ImageStatistics(total.kind, int(images), counts, sums))
-            summaries |= {int(episode): one for episode, one in json.loads(str(content["summaries"])).items()}
-    collected = {key: total.summary() for key, total in totals.items()}
+                summaries[key].append(content[f"{key}/summaries"])
+    lengths = [row["length"] for row in source.episodes]
+    collected = {key: image_summary(total.summary(), total.images) for key, total in totals.items()}
+    of_episodes = {key: image_summary(np.concatenate(values), lengths) for key, values in summaries.items()}
     for key, values in _added_vectors(derivation).items():
-        collected[key] = constant_summary(values, source.info["total_frames"])
-        for episode, one in summaries.items():
-            one[key] = constant_summary(values, source.episodes[episode]["length"])
-    return collected, summaries
+        collected[key] = constant_summary(values, sum(lengths))
+        each = [constant_summary(values, length) for length in lengths]
+        of_episodes[key] = {name: [one[name] for one in each] for name in each[0]}
+    return collected, of_episodes
 
 
 def _rewrite_episodes(
-    file: Path, derivation: Derivation, source: SourceDataset, parts: list[range], summaries: dict[int, dict[str, Any]]
+    file: Path,
+    derivation: Derivation,
+    source: SourceDataset,
+    parts: list[range],
+    statistics: dict[str, dict[str, list[Any]]],
 ) -> None:
     """Say where each episode's table is now, and add and drop statistics."""
     table = pq.read_table(file).replace_schema_metadata(None)
@@ -275,10 +283,10 @@ def _rewrite_episodes(
     places = np.array([derivation.place(source, part_of_episode[episode]) for episode in episodes])
     for column, values in (("data/chunk_index", places[:, 0]), ("data/file_index", places[:, 1])):
         table = table.set_column(table.column_names.index(column), column, pa.array(values))
-    for key, summary in summaries[episodes[0]].items():
-        for name in summary:
-            values = pa.array([summaries[episode][key][name] for episode in episodes])
-            table = table.append_column(f"stats/{key}/{name}", values)
+    for key, named in statistics.items():
+        for name, of_episodes in named.items():
+            column = pa.array([of_episodes[episode] for episode in episodes])
+            table = table.append_column(f"stats/{key}/{name}", column)
     pq.write_table(table, file)
 
 

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+SUMMARY = ("min", "max", "mean", "std", *QUANTILES)
 LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: what lies outside counts, for quantiles, as lying at the border
 PER_METRE = round(1 / STEP)
 LEVELS = LOWEST + STEP * np.arange(round((HIGHEST - LOWEST) / STEP) + 1)
@@ -56,10 +57,9 @@ class ImageStatistics:
         self.sums[:, 1] = np.maximum(self.sums[:, 1], other.sums[:, 1])
         self.sums[:, 2:] += other.sums[:, 2:]
 
-    def summary(self) -> dict[str, Any]:
-        """Return LeRobot's statistics of an image feature: lists of shape (C, 1, 1), and the number of images."""
-        cumulative = self.counts.cumsum(axis=1)
-        total = cumulative[:, -1]
+    def summary(self) -> NDArray[np.float64]:
+        """Return what `SUMMARY` names of every channel: (9, C) float64."""
+        total = self.counts.sum(axis=1)
         if self.kind == "rgb":
             levels: NDArray = np.arange(256) / 255
             seen = self.counts > 0
@@ -71,17 +71,44 @@ class ImageStatistics:
             minimum, maximum = self.sums[:, 0], self.sums[:, 1]
             mean = self.sums[:, 2] / total
             variance = self.sums[:, 3] / total - mean**2
-        values = {"min": minimum, "max": maximum, "mean": mean, "std": np.sqrt(np.maximum(variance, 0.0))}
-        ranks = np.ceil(np.outer(total, list(QUANTILES.values()))).astype(np.int64)
-        quantiles = np.array([levels[np.searchsorted(*one)] for one in zip(cumulative, ranks, strict=True)])
-        values |= dict(zip(QUANTILES, quantiles.T, strict=True))
-        return {name: value.reshape(-1, 1, 1).tolist() for name, value in values.items()} | {"count": [self.images]}
+        ranks = np.ceil(np.outer(list(QUANTILES.values()), total)).astype(np.int64)
+        quantiles = levels[_bins(self.counts, ranks)]
+        return np.concatenate([[minimum, maximum, mean, np.sqrt(np.maximum(variance, 0.0))], quantiles])
+
+
+def image_summary(summary: NDArray[np.float64], images: Any) -> dict[str, Any]:
+    """Return LeRobot's statistics of image features, from one summary or from many.
+
+    Args:
+        summary: (..., 9, C), by `ImageStatistics.summary`.
+        images: (...) how many images each is of.
+
+    Returns:
+        Lists of shape (..., C, 1, 1), and of shape (..., 1) the number of images.
+    """
+    values = np.moveaxis(summary, -2, 0)[..., None, None]
+    named = {name: value.tolist() for name, value in zip(SUMMARY, values, strict=True)}
+    return named | {"count": np.asarray(images)[..., None].tolist()}
 
 
 def constant_summary(values: NDArray[np.floating], count: int) -> dict[str, Any]:
     """Return LeRobot's statistics of a feature that is `values` (N,) in each of `count` frames."""
     same = {name: values.tolist() for name in ("min", "max", "mean", *QUANTILES)}
     return same | {"std": np.zeros_like(values).tolist(), "count": [count]}
+
+
+@njit(cache=True, nogil=True)
+def _bins(counts, ranks):  # type: ignore[no-untyped-def]
+    """Return in which bin of counts (C, bins) each of the ranks (N, C), ascending and from 1, lies: (N, C)."""
+    bins = np.empty(ranks.shape, np.int64)
+    for channel in range(len(counts)):
+        reached, level = counts[channel, 0], 0
+        for i in range(len(ranks)):
+            while reached < ranks[i, channel]:
+                level += 1
+                reached += counts[channel, level]
+            bins[i, channel] = level
+    return bins
 
 
 @njit(cache=True, nogil=True)

@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
 
-from lerobot_symview.image_statistics import HIGHEST, LOWEST, QUANTILES, STEP, ImageStatistics, constant_summary
+from lerobot_symview.image_statistics import (
+    HIGHEST,
+    LOWEST,
+    QUANTILES,
+    STEP,
+    ImageStatistics,
+    constant_summary,
+    image_summary,
+)
 
 IMAGES = {
     "rgb": [np.random.default_rng(i).integers(0, 200 + i, (9, 7, 3), dtype=np.uint8) for i in range(5)],
@@ -19,7 +27,7 @@ def counted(kind, images):
 @pytest.mark.parametrize("kind", IMAGES)
 def test_statistics_are_numpys_over_all_pixels(kind):
     values = np.stack(IMAGES[kind]).reshape(-1, 3 if kind == "rgb" else 1) / (255 if kind == "rgb" else 1)
-    summary = counted(kind, IMAGES[kind]).summary()
+    summary = image_summary(counted(kind, IMAGES[kind]).summary(), 5)
     assert summary["count"] == [5]
     for name in ("min", "max", "mean", "std"):
         assert np.shape(summary[name]) == (values.shape[1], 1, 1)
@@ -34,13 +42,19 @@ def test_statistics_are_numpys_over_all_pixels(kind):
 def test_parts_add_up_to_the_whole(kind):
     merged = counted(kind, IMAGES[kind][:2])
     merged.merge(counted(kind, IMAGES[kind][2:]))
-    whole = counted(kind, IMAGES[kind]).summary()
-    for name, value in merged.summary().items():
-        np.testing.assert_allclose(value, whole[name], rtol=1e-12)
+    np.testing.assert_allclose(merged.summary(), counted(kind, IMAGES[kind]).summary(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", IMAGES)
+def test_many_summaries_are_lists_of_the_single_ones(kind):
+    summaries = [counted(kind, [image]).summary() for image in IMAGES[kind][:3]]
+    many = image_summary(np.stack(summaries), [1, 2, 3])
+    for index, summary in enumerate(summaries):
+        assert image_summary(summary, index + 1) == {name: values[index] for name, values in many.items()}
 
 
 def test_heights_beyond_the_histogram_count_as_its_border():
-    summary = counted("height", [np.array([[-3.0, 0.0, 5.0]], dtype=np.float32)]).summary()
+    summary = image_summary(counted("height", [np.array([[-3.0, 0.0, 5.0]], dtype=np.float32)]).summary(), 1)
     assert (np.ravel(summary["min"]), np.ravel(summary["max"])) == (-3.0, 5.0)
     np.testing.assert_allclose([np.ravel(summary["q01"]), np.ravel(summary["q99"])], [[LOWEST], [HIGHEST]])
 
