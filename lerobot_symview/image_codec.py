@@ -49,6 +49,8 @@ def _tiff_size(data: memoryview, order: str) -> tuple[int, int]:
         tag, kind, _ = struct.unpack_from(f"{order}HHI", data, offset)
         if tag in (TIFF_WIDTH, TIFF_HEIGHT):
             (values[tag],) = struct.unpack_from(f"{order}{TIFF_TYPES[kind]}", data, offset + 8)
+            if len(values) == 2:
+                break
     return values[TIFF_HEIGHT], values[TIFF_WIDTH]
 
 

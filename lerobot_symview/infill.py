@@ -22,9 +22,8 @@ def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
         (H, W) int32, row-major index of the nearest known pixel, which for a known one is itself. Of equally near ones
         the one in the leftmost column, and in that the uppermost. -1 everywhere if none is known.
     """
-    nearest = np.full(known.shape, -1, dtype=np.int32)
-    if known.any():
-        _find_nearest(known, np.empty(known.shape, dtype=np.int32), nearest)
+    row_of, nearest = np.empty(known.shape, dtype=np.int32), np.empty(known.shape, dtype=np.int32)
+    _find_nearest(known, row_of, nearest)
     return nearest
 
 
@@ -66,6 +65,9 @@ def _find_nearest(known, row_of, nearest):  # type: ignore[no-untyped-def]
         for c in range(columns):
             above, below = here[c], row_below[c]
             here[c] = below if (below > row) & (np.int32(below + above) < twice) else above
+    if row_of[0].max() < 0:
+        nearest[:] = -1
+        return
     # Squared distances in rows, between borders that are too far to be chosen, so that no step need be tested.
     border = columns + NEAR
     far = np.full(columns + 2 * border, NOWHERE**2, dtype=np.int32)

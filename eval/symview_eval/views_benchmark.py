@@ -57,18 +57,21 @@ class ViewsBenchmark:
     """How often each view is made; each time is followed by one of OpenCV's warp, whose ratio counts."""
     frames: int = 10_000
     """Frames of the dataset to which views are added; 0 leaves that out. A second process takes seconds to start."""
+    rounds: int = 3
+    """How often views are added to all of it, by one process and by two."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
     def __post_init__(self) -> None:
-        if self.repeats < 1:
-            raise ValueError(f"--repeats must be at least 1, got {self.repeats}")
+        for name in ("repeats", "rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if self.frames < 0:
             raise ValueError(f"--frames must not be negative, got {self.frames}")
 
 
 def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
-    """Return medians, quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
+    """Return medians, and quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
 
     `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
     costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
@@ -82,7 +85,7 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
     finally:
         cv2.setNumThreads(threads)
     results |= _on_a_gpu(config.repeats)
-    return results | (_offline(config.frames) if config.frames else {})
+    return results | (_offline(config.frames, config.rounds) if config.frames else {})
 
 
 def _on_a_gpu(repeats: int) -> dict[str, float]:
@@ -170,37 +173,43 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
             reference = seconds(warp)
             warps.append(reference)
             ratios.append(seconds(candidate) / reference)
-        # inclusive: no quartile lies outside of what was measured
-        low, median, high = statistics.quantiles(ratios, n=4, method="inclusive") if repeats > 1 else ratios * 3
-        results |= {f"{name}_ratio": median, f"{name}_ratio_low": low, f"{name}_ratio_high": high}
+        results |= _median_and_quartiles(f"{name}_ratio", ratios)
     return {"warp_us": 1e6 * statistics.median(warps)} | results
 
 
-def _offline(frames: int) -> dict[str, float]:
+def _median_and_quartiles(name: str, values: list[float]) -> dict[str, float]:
+    # inclusive: no quartile lies outside of what was measured
+    low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
+    return {name: median, f"{name}_low": low, f"{name}_high": high}
+
+
+def _offline(frames: int, rounds: int) -> dict[str, float]:
+    found: dict[str, list[float]] = {"offline_codec_share": [], "offline_two_process_speedup": [], "frames_per_s": []}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recorded, source = _repeated_dataset(folder, frames)
+        total = SourceDataset(source).info["total_frames"]
 
-        def add(dataset: Path, target: str, num_workers: int = 1) -> float:
+        def add(dataset: Path, num_workers: int = 1) -> float:
+            target = folder / "views"
             config = AddViewsConfig(
                 PushedDataset("benchmark/source", dataset),
-                new_root=folder / target,
+                new_root=target,
                 views=["reproj", "persp"],
                 num_workers=num_workers,
             )
-            return seconds(lambda: add_views(config))
+            taken = seconds(lambda: add_views(config))
+            shutil.rmtree(target)
+            return taken
 
-        add(recorded, "first")  # imports and compiled kernels are loaded before the clocks start
-        with _codec_clocks() as clocks:
-            alone = add(source, "single")
-        shutil.rmtree(folder / "single")
-        together = add(source, "double", num_workers=2)
-        total = SourceDataset(source).info["total_frames"]
-    return {
-        "offline_codec_share": sum(clock.milliseconds for clock in clocks) / 1000 / alone,
-        "offline_two_process_speedup": alone / together,
-        "frames_per_s": total / alone,
-    }
+        add(recorded)  # imports and compiled kernels are loaded before the clocks start
+        for _ in range(rounds):
+            with _codec_clocks() as clocks:
+                alone = add(source)
+            found["offline_codec_share"].append(sum(clock.milliseconds for clock in clocks) / 1000 / alone)
+            found["offline_two_process_speedup"].append(alone / add(source, num_workers=2))
+            found["frames_per_s"].append(total / alone)
+    return {key: value for name, values in found.items() for key, value in _median_and_quartiles(name, values).items()}
 
 
 def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
