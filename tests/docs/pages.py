@@ -36,6 +36,13 @@ SMALL = {
     "lerobot-train": TRAINING | {"--num_workers": 0, "--env_eval_freq": 0},
     "--policy.type=symview_bc": NETWORK,
     "--policy.type=act": {"--policy.pretrained_backbone_weights": "null"},  # which are downloaded from elsewhere
+    "--policy.type=diffusion": {
+        "--policy.pretrained_backbone_weights": "null",
+        "--policy.horizon": 8,
+        "--policy.n_action_steps": 4,
+        "--policy.drop_n_last_frames": 1,
+        "--policy.down_dims": "[16, 32]",
+    },
     "lerobot-eval": EVALUATION,
     "lerobot-dataset-viz": {"--save": 1, "--output-dir": "."},
 }

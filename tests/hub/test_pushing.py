@@ -27,6 +27,14 @@ from tests.hub.client import online
 from tests.hub.server import ALICE, BOB, HubServer
 from tests.lerobot_policy_symview.test_training import train
 
+STOCK = {  # as small as they go
+    "act": ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32"]
+    + ["--policy.pretrained_backbone_weights=null"],
+    "diffusion": ["--policy.horizon=8", "--policy.n_action_steps=4", "--policy.drop_n_last_frames=1"]
+    + ["--policy.down_dims=[16,32]", "--policy.num_train_timesteps=4"]
+    + ["--policy.pretrained_backbone_weights=null"],
+}
+
 
 @pytest.fixture
 def hub():
@@ -147,8 +155,9 @@ def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
 
 
-def test_a_stock_policy_brings_its_view_along_to_another_process(recorded, tmp_path, monkeypatch):
-    """ACT, trained on a view, with our step in its preprocessing: who has the plugin evaluates it from the Hub."""
+@pytest.mark.parametrize(("policy", "options"), STOCK.items())
+def test_a_stock_policy_brings_its_view_along_to_another_process(policy, options, recorded, tmp_path, monkeypatch):
+    """Trained on a view, with our step in its preprocessing: who has the plugin evaluates it from the Hub."""
     config = AddViewsConfig(
         PushedDataset("test/recorded", recorded),
         new_root=tmp_path / "stock",
@@ -157,12 +166,11 @@ def test_a_stock_policy_brings_its_view_along_to_another_process(recorded, tmp_p
         for_stock_policies=True,
     )
     arguments = ["lerobot-train", "--dataset.repo_id=test/stock", f"--dataset.root={add_views(config)}"]
-    arguments += ["--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.dim_model=32"]
-    arguments += ["--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.pretrained_backbone_weights=null"]
-    arguments += ["--steps=1", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={tmp_path}/act"]
+    arguments += [f"--policy.type={policy}", "--policy.push_to_hub=false", "--policy.device=cpu", *options]
+    arguments += ["--steps=1", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", f"--output_dir={tmp_path}/run"]
     monkeypatch.setattr(sys, "argv", arguments)
     lerobot_train.main()
-    checkpoint = tmp_path / "act" / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     preprocessor = make_pre_post_processors(PreTrainedConfig.from_pretrained(checkpoint), str(checkpoint))[0]
     step = ViewsProcessorStep(views={"reproj": {"size": VIEW_SIZE, "height": False}})
     preprocessor.steps.insert(-1, step)  # before the normalisation
@@ -172,11 +180,11 @@ def test_a_stock_policy_brings_its_view_along_to_another_process(recorded, tmp_p
     evaluation += ["--policy.device=cpu", f"--rename_map={same_name}", f"--output_dir={tmp_path / 'eval'}"]
     with HubServer() as hub:
         with online(hub, ALICE):
-            create_repo("alice/act")
-            upload_folder(repo_id="alice/act", folder_path=checkpoint)
+            create_repo("alice/stock")
+            upload_folder(repo_id="alice/stock", folder_path=checkpoint)
         program = shutil.which("lerobot-eval", path=os.path.dirname(sys.executable))
         home = {"HF_HOME": str(tmp_path / "home"), "HF_LEROBOT_HOME": str(tmp_path / "home" / "lerobot")}
-        command = [program, "--policy.path=alice/act", *evaluation]
+        command = [program, "--policy.path=alice/stock", *evaluation]
         done = subprocess.run(command, env=os.environ | hub.environment(ALICE) | home, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
