@@ -11,7 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partialmethod
-from importlib import import_module
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import wait
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -54,14 +54,19 @@ class ProcessExecutor:
 
     Args:
         num_workers: how many processes.
-        module: what they are going to run; imported at once, while the caller prepares their work.
+        module: what they are going to run; imported at once and once for all, while the caller prepares their work.
     """
 
     def __init__(self, num_workers: int, module: str):
         context = multiprocessing.get_context("forkserver")
+        context.set_forkserver_preload([module])
+        resource_tracker.ensure_running()  # else the server starts it, which unblocks signals
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # Ctrl-C is this process's to answer
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._pool = ProcessPoolExecutor(num_workers, mp_context=context, initializer=_start_worker)
-        for _ in range(num_workers):
-            self._pool.submit(import_module, module)
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
         """Yield the results as they come.

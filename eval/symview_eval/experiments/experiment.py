@@ -84,10 +84,10 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
 
 
 def _run(cells: Sequence[Cell], config: ExperimentConfig) -> None:
-    from symview_eval.experiments.cells import Done, Job, record, run_cell
-
     results, folder = config.results_dir.resolve(), config.output_dir.resolve()
     with EXECUTORS[config.executor](config.num_workers, "symview_eval.experiments.cells") as executor:
+        from symview_eval.experiments.cells import Done, Job, record, run_cell  # while the executor does so, too
+
         jobs = [Job(cell, results, folder, config.device) for cell in cells]
         recordings = {job.cell.recording: job for job in jobs}.values()
         recorded = tqdm(executor.run(record, recordings), desc="demonstrations", total=len(recordings), unit="dataset")
