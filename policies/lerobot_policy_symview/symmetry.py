@@ -103,12 +103,26 @@ class Symmetry:
                 )
 
     def check(self, size: int, feature: str, names: Sequence[str] | None = None) -> None:
-        """Raise a ValueError unless `feature`, which has `size` entries called `names`, is what is declared."""
+        """Raise a ValueError unless `feature`, which has `size` entries called `names`, can be what is declared.
+
+        A name that is a kind, or one after a `d` for an increment, must be declared as that kind, as one that moves
+        alike, or as `scalar`, which gives its symmetry up; other names say nothing.
+        """
         if len(self.entries) != size:
             called = f" ({', '.join(names)})" if names else ""
             raise ValueError(
                 f"{self.flag} describes {len(self.entries)} entries, {list(self.entries)}; {feature!r} has "
                 f"{size}{called}: state one kind for each, such as {self.flag}='[x, y, z, yaw, aperture]'"
+            )
+        wrong = [
+            f"{name!r} as {entry!r}"
+            for name, entry in zip(names or (), self.entries, strict=False)
+            if not _can_be(name if name in KINDS else name.removeprefix("d"), entry.partition(":")[0])
+        ]
+        if wrong:
+            raise ValueError(
+                f"{self.flag} declares {', '.join(wrong)}: {feature!r} is {', '.join(names or ())}, "
+                "state the kinds in this order"
             )
 
     @cached_property
@@ -180,6 +194,12 @@ class Symmetry:
         for index in self.signs:
             center[index], width[index] = 0.0, extent[index]
         return center, torch.where(width > SMALLEST_EXTENT, width, torch.ones_like(width))
+
+
+def _can_be(name: str, kind: str) -> bool:
+    """Whether an entry called `name` may be declared as `kind`: not if it is a kind that moves otherwise."""
+    alike = {"yaw": "sign", "z": "scalar", "aperture": "scalar"}
+    return name not in KINDS or kind == "scalar" or alike.get(name, name) == alike.get(kind, kind)
 
 
 def _named(kind: str, name: str) -> str:

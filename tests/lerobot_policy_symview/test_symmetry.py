@@ -93,3 +93,29 @@ def test_a_wrong_declaration_is_refused_by_its_flag(kinds, message):
 def test_a_declaration_of_another_size_is_refused_with_the_features_names():
     with pytest.raises(ValueError, match=r"describes 2 entries.*'action' has 3 \(dx, dy, dz\).*action_symmetry="):
         Symmetry(("x", "y"), "--policy.action_symmetry").check(3, "action", ["dx", "dy", "dz"])
+
+
+@pytest.mark.parametrize(
+    ("kinds", "names", "wrong"),
+    [
+        (("x", "y", "z"), ["dx", "dz", "dy"], "'dz' as 'y', 'dy' as 'z'"),
+        (("x:left", "y:left", "yaw"), ["y", "x", "yaw"], "'y' as 'x:left', 'x' as 'y:left'"),
+        (("aperture", "scalar", "sign"), ["scalar", "z", "rx"], "'rx' as 'sign'"),
+    ],
+)
+def test_kinds_that_contradict_the_features_names_are_refused(kinds, names, wrong):
+    with pytest.raises(ValueError, match=f"action_symmetry declares {wrong}: 'action' is {', '.join(names)}"):
+        Symmetry(kinds, "--policy.action_symmetry").check(len(kinds), "action", names)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "names"),
+    [
+        (("x", "y", "scalar"), ["dx", "dy", "dyaw"]),
+        (("sign", "z", "aperture"), ["yaw", "aperture", "dz"]),
+        (("x", "y", "z"), ["px", "py", "depth"]),
+        (("x", "y"), None),
+    ],
+)
+def test_kinds_that_can_be_what_the_names_say_are_accepted(kinds, names):
+    Symmetry(kinds).check(len(kinds), "action", names)
