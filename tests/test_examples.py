@@ -102,6 +102,11 @@ TRIALS = {
         (r"the block is at x = 0\.\d+ m, y = -?0\.\d+ m",),
         ("views.png",),
     ),
+    "why_success_swings": Trial(
+        "--steps=2 --episodes=1 --demonstrations=1 --noise=0.03 --output_dir={output}",
+        (r"step 000001: \d+ %, \d+ % as if open$", r"step 000002: \d+ %, \d+ % as if open$"),
+        ("policy/checkpoints/last/pretrained_model/model.safetensors",),
+    ),
 }
 
 

@@ -85,7 +85,8 @@ def files(installed: Distribution) -> Iterator[tuple[PurePosixPath, Path]]:
 def archive(installed: Distribution, folder: Path) -> Path:
     """Write a distribution's archive and return it."""
     target = folder / f"{_normal(installed.name)}.tar.xz"
-    with tarfile.open(target, "w:xz", preset=6) as stream, tempfile.TemporaryDirectory() as scratch:
+    # preset 2: 13 % larger than 6, three times faster
+    with tarfile.open(target, "w:xz", preset=2) as stream, tempfile.TemporaryDirectory() as scratch:
         for place, path in files(installed):
             info = tarfile.TarInfo(str(place))
             compiled_here = installed.name == "pybullet" and path.suffix == ".so"  # wheels come without symbols

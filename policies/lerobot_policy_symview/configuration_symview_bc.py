@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,10 +20,21 @@ class SymviewBcConfig(SymviewConfig):
 
     learning_rate_decay: Literal["none", "cosine"] = "none"
     """`cosine` lowers the rate to zero over the training, `none` keeps it, as in the paper."""
+    aperture_noise: float = 0.0
+    """Standard deviation of noise on the state's `aperture` entries in training, in their unit. Experts open a gripper
+    to the same aperture every time, a policy does not quite; without noise it may take that for something else.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_choice("learning_rate_decay", ("none", "cosine"))
+        if not 0 <= self.aperture_noise < math.inf:
+            raise ValueError(f"--policy.aperture_noise must be finite and at least 0, got {self.aperture_noise}")
+        if self.aperture_noise and not self.states.of_kind("aperture"):
+            raise ValueError(
+                f"--policy.aperture_noise={self.aperture_noise} needs an entry `aperture` in --policy.state_symmetry, "
+                f"got {self.state_symmetry}"
+            )
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """Return the schedule that `learning_rate_decay` names."""

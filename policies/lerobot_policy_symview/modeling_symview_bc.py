@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.heads import RegressionHead
 from lerobot_policy_symview.layers import asymmetry
 from lerobot_policy_symview.policy import Network, SymviewPolicy
+from lerobot_symview import keys
 
 
 class SymviewBcPolicy(SymviewPolicy):
     """Predicts the expert's action from one observation by least squares."""
 
     config_class = SymviewBcConfig
+    config: SymviewBcConfig
     name = "symview_bc"
 
     def __init__(self, config: SymviewBcConfig, dataset_stats: dict[str, dict[str, Any]] | None = None, **kwargs: Any):
@@ -28,6 +31,8 @@ class SymviewBcPolicy(SymviewPolicy):
 
         That is nothing but for relaxed networks: reading a number from a GPU would make every step wait for it.
         """
+        if self.training and self.config.aperture_noise:
+            batch = batch | {keys.STATE: self._noisy(batch[keys.STATE])}
         picture, state, action = self.training_input(batch)
         errors = self.network.head.loss(self.network.encoder(picture, state), action).mean(dim=1)
         output = {}
@@ -36,6 +41,13 @@ class SymviewBcPolicy(SymviewPolicy):
             output["asymmetry"] = penalty.item()
             errors = errors + self.config.relaxation_weight * penalty
         return (errors if reduction == "none" else errors.mean()), output
+
+    def _noisy(self, state: Tensor) -> Tensor:
+        """Return states (B, S) with other apertures."""
+        entries = self.config.states.of_kind("aperture")
+        noisy = state.clone()
+        noisy[:, entries] += self.config.aperture_noise * torch.randn_like(noisy[:, entries])
+        return noisy
 
     def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
         """Return the scaled action (B, A)."""

@@ -135,6 +135,10 @@ class Symmetry:
                 found.append((index, self.entries.index(_named(PAIRS[kind], name))))
         return found
 
+    def of_kind(self, kind: str) -> list[int]:
+        """Return the indices of the entries of a kind, with or without a name."""
+        return [i for i, entry in enumerate(self.entries) if entry.split(":")[0] == kind]
+
     @cached_property
     def signs(self) -> list[int]:
         """Indices of the entries that mirror images negate."""

@@ -135,6 +135,35 @@ def test_losses_can_be_weighed_sample_by_sample():
     assert output == {"asymmetry": 0.0}
 
 
+def test_noise_in_training_reaches_the_aperture_and_nothing_else(monkeypatch):
+    states = []
+    original = SymviewBcPolicy.training_input
+    monkeypatch.setattr(
+        SymviewBcPolicy, "training_input", lambda self, batch: states.append(batch[keys.STATE]) or original(self, batch)
+    )
+    policy = make_policy(aperture_noise=0.03)
+    batch = training_batch(policy.config, batch=200)
+    before = batch[keys.STATE].clone()
+    policy.train().forward(dict(batch))
+    policy.eval().forward(dict(batch))
+    added = states[0] - before
+    assert (added[:, :4] == 0).all()
+    assert 0.02 < added[:, 4].std() < 0.04
+    assert (states[1] == before).all()
+    assert (batch[keys.STATE] == before).all()
+
+
+@pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf")])
+def test_impossible_noise_is_refused(noise):
+    with pytest.raises(ValueError, match="aperture_noise must be finite and at least 0"):
+        make_config(aperture_noise=noise)
+
+
+def test_noise_on_an_aperture_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="needs an entry `aperture` in --policy"):
+        make_config(aperture_noise=0.1, state_symmetry=["x", "y", "z"], gripper_input="vector")
+
+
 TRAINED = {
     "reproj_equi": 1_113_098,
     "persp_equi": 1_113_050,
