@@ -1,6 +1,6 @@
 """At a constant rate success swings from checkpoint to checkpoint. The aperture that a policy sees is why.
 
-    python examples/why_success_swings.py --steps=1200 --episodes=60
+    python examples/why_success_swings.py --seed=1
 
 An expert always opens its gripper to the same aperture; a policy sees others, of no demonstration. Checkpoints act as
 they are, then with apertures above 0.85 shown as 1, nothing else changed. `--noise=0.03` trains with such apertures.
@@ -18,7 +18,6 @@ from lerobot.scripts.lerobot_train import train
 from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rollouts import Actor, evaluate, observed
-from lerobot_symview import keys
 from lerobot_symview.add_views import AddViewsConfig, add_views
 from lerobot_symview.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, generate
@@ -30,19 +29,20 @@ logger = logging.getLogger(__name__)
 
 def as_if_open(observation: dict) -> dict:
     """Return an observation in which a gripper that is nearly open is open."""
-    *pose, aperture = observation[keys.STATE]
-    return observation | {keys.STATE: np.array([*pose, 1.0 if aperture > 0.85 else aperture], dtype=np.float32)}
+    *pose, seen = observation["observation.state"]
+    return observation | {"observation.state": np.array([*pose, 1.0 if seen > 0.85 else seen], dtype=np.float32)}
 
 
 def main(steps: int, episodes: int, demonstrations: int, noise: float, seed: int, output_dir: Path) -> None:
     """Record, train, and evaluate every checkpoint twice, in the same scenes."""
-    recorded = generate(GenerateConfig(NewDataset("me/picking", output_dir / "picking"), num_episodes=demonstrations))
-    views = AddViewsConfig(PushedDataset("me/picking", recorded), new_root=output_dir / "views", size=76, keep=[])
-    data, run = DatasetConfig("me/picking_views", root=str(add_views(views))), output_dir / "policy"
+    picking = NewDataset("me/picking", output_dir / "picking")
+    source = PushedDataset("me/picking", generate(GenerateConfig(picking, num_episodes=demonstrations, resume=True)))
+    seen = add_views(AddViewsConfig(source, new_root=output_dir / "views", size=76, keep=[], resume=True))
     policy = SymviewBcConfig(device="cpu", width=16, crop_size=64, aperture_noise=noise, push_to_hub=False)
     options = {"save_freq": max(steps // 12, 1), "env_eval_freq": 0, "log_freq": 100, "seed": seed, "num_workers": 0}
-    train(TrainPipelineConfig(data, policy=policy, steps=steps, batch_size=16, output_dir=run, **options))
-    for checkpoint in sorted((run / "checkpoints").glob("0*")):
+    options |= {"dataset": DatasetConfig("me/picking_views", root=str(seen)), "steps": steps, "batch_size": 16}
+    train(TrainPipelineConfig(policy=policy, output_dir=output_dir / f"policy_{noise:g}_{seed}", **options))
+    for checkpoint in sorted((output_dir / f"policy_{noise:g}_{seed}" / "checkpoints").glob("0*")):
         act = Actor(SymviewBcPolicy.from_pretrained(checkpoint / "pretrained_model"))
         looks = act, lambda seen, act=act: act([*map(as_if_open, seen)])
         with Simulators(observed(act.policy.config, EnvSettings("block_picking")), count=2) as simulators:
@@ -52,8 +52,8 @@ def main(steps: int, episodes: int, demonstrations: int, noise: float, seed: int
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options = {"steps": 1200, "episodes": 60, "demonstrations": 20, "noise": 0.0, "seed": 0}
-    for name, default in {**options, "output_dir": Path("outputs/examples/swing")}.items():
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/examples/swing"))
+    for name, default in (("steps", 1200), ("episodes", 60), ("demonstrations", 20), ("noise", 0.0), ("seed", 0)):
         parser.add_argument(f"--{name}", type=type(default), default=default)
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)

@@ -34,6 +34,7 @@ from lerobot_symview.views import View
 from lerobot_symview.workspace import Workspace
 
 PART_FRAMES = 200  # at least, where a file of the source has as many
+PARTS_FORMAT = 2  # of what an interrupted run leaves: 1 had its statistics as JSON
 MADE_FROM = "symview_views.json"  # in the result's `meta`
 
 

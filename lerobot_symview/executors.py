@@ -54,7 +54,8 @@ class ProcessExecutor:
 
     Args:
         num_workers: how many processes.
-        module: what they are going to run; imported at once and once for all, while the caller prepares their work.
+        module: what they are going to run; imported at once and once for all, while the caller prepares their work,
+            unless this process has started others before.
     """
 
     def __init__(self, num_workers: int, module: str):

@@ -23,7 +23,8 @@ def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
         the one in the leftmost column, and in that the uppermost. -1 everywhere if none is known.
     """
     row_of, nearest = np.empty(known.shape, dtype=np.int32), np.empty(known.shape, dtype=np.int32)
-    _find_nearest(known, row_of, nearest)
+    if known.size:
+        _find_nearest(known, row_of, nearest)
     return nearest
 
 

@@ -105,7 +105,7 @@ TRIALS = {
     "why_success_swings": Trial(
         "--steps=2 --episodes=1 --demonstrations=1 --noise=0.03 --output_dir={output}",
         (r"step 000001: \d+ %, \d+ % as if open$", r"step 000002: \d+ %, \d+ % as if open$"),
-        ("policy/checkpoints/last/pretrained_model/model.safetensors",),
+        ("policy_0.03_0/checkpoints/last/pretrained_model/model.safetensors",),
     ),
 }
 

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -90,7 +91,7 @@ class PlainNetwork(nn.Module):
         """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
         planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
         features = torch.cat([picture, planes], dim=1)
-        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as ours
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda or picture.dtype == torch.bfloat16:
             features = features.contiguous(memory_format=torch.channels_last)
         for layer, pool in zip(self.layers, self.pooled, strict=True):
             features = layer(features)
@@ -103,7 +104,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
 
     `train_step_ratio_escnn_fp32` and `train_step_ratio_plain` compare a training step with escnn's and with that of an
     ordinary network of the same expanded widths in its faster precision, `inference_ratio_b1` and `_b5` inference with
-    the latter's. `train_step_floor_s` is what its arithmetic takes at the rate of large matrix products.
+    the latter's. `train_step_floor_s` is what its arithmetic takes at the rate of large matrix products, in `--dtype`.
     `plugin_import_s` is what the plugin adds to LeRobot's import, `loader_share` what loading a batch takes over what a
     training step does.
     """
@@ -187,9 +188,13 @@ def _training_step(network: nn.Module, picture: Tensor, state: Tensor, dtype: st
 
 
 def _inference(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
+    if isinstance(network, PlainNetwork):  # converted once, not at every call as by autocast
+        kind = getattr(torch, dtype)
+        network, picture, state = deepcopy(network).to(kind), picture.to(kind), state.to(kind)
+
     def run() -> None:
-        reduced = torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
-        with torch.inference_mode(), reduced:
+        reduced = dtype == "bfloat16" and not isinstance(network, PlainNetwork)
+        with torch.inference_mode(), torch.autocast(picture.device.type, torch.bfloat16, enabled=reduced):
             network(picture, state)
 
     return run

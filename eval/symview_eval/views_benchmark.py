@@ -71,12 +71,13 @@ class ViewsBenchmark:
 
 
 def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
-    """Return medians, and quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
+    """Return medians, with quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
 
     `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
     costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
     decoding, encoding and writing, for images with a real camera's noise; `offline_two_process_speedup` what a second
-    process gains, start-up included; `frames_per_s` what one process makes of both views.
+    process gains, start-up included, of which the first round has most; `frames_per_s` what one process makes of both
+    views. These have quartiles, too.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)

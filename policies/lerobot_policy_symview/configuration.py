@@ -284,7 +284,7 @@ class SymviewConfig(PreTrainedConfig):
         """
         for symmetry, key in ((self.states, keys.STATE), (self.actions, keys.ACTION)):
             size, names = _entries(features, key)
-            symmetry.check(size, key, names)
+            symmetry.check(size, key, names if self.group != "C1" else None)
         made = features.get(self.color_key, {}).get("info") or {}
         if self.is_computed and "symview" in made:
             try:
@@ -360,7 +360,8 @@ def _entries(features: dict[str, dict[str, Any]], key: str) -> tuple[int, list[s
             f"the dataset has no feature {key!r}, which symview's policies need; it has {sorted(features)}"
         )
     names = features[key].get("names")
-    return int(features[key]["shape"][0]), names if isinstance(names, list) else None
+    are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return int(features[key]["shape"][0]), names if are_names else None
 
 
 def _channel_first(features: dict[str, dict[str, Any]], key: str) -> tuple[int, ...]:

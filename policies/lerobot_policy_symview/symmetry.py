@@ -105,8 +105,8 @@ class Symmetry:
     def check(self, size: int, feature: str, names: Sequence[str] | None = None) -> None:
         """Raise a ValueError unless `feature`, which has `size` entries called `names`, can be what is declared.
 
-        A name that is a kind, or one after a `d` for an increment, must be declared as that kind, as one that moves
-        alike, or as `scalar`, which gives its symmetry up; other names say nothing.
+        A name that is a kind, or one after a `d` for an increment, must be declared as that kind or as `scalar`, which
+        gives its symmetry up; names of what keeps its value may be declared as any such kind, other names say nothing.
         """
         if len(self.entries) != size:
             called = f" ({', '.join(names)})" if names else ""
@@ -122,7 +122,7 @@ class Symmetry:
         if wrong:
             raise ValueError(
                 f"{self.flag} declares {', '.join(wrong)}: {feature!r} is {', '.join(names or ())}, "
-                "state the kinds in this order"
+                "state the kinds in this order, or rename the dataset's entries if they are something else"
             )
 
     @cached_property
@@ -202,7 +202,7 @@ class Symmetry:
 
 def _can_be(name: str, kind: str) -> bool:
     """Whether an entry called `name` may be declared as `kind`: not if it is a kind that moves otherwise."""
-    alike = {"yaw": "sign", "z": "scalar", "aperture": "scalar"}
+    alike = {"z": "scalar", "aperture": "scalar"}
     return name not in KINDS or kind == "scalar" or alike.get(name, name) == alike.get(kind, kind)
 
 

@@ -10,18 +10,21 @@ from functools import lru_cache
 
 import torch
 
+_callers: set[int] = set()  # threads that have work done in threads
+
 
 @lru_cache
 def _workers(count: int) -> ThreadPoolExecutor:
-    threads = torch.get_num_threads()
-    pool = ThreadPoolExecutor(count, "symview", initializer=torch.set_num_threads, initargs=(1,))
-    barrier = threading.Barrier(count)
-    list(pool.map(lambda _: barrier.wait(), range(count)))  # start all, then undo what they set for threads to come
-    torch.set_num_threads(threads)
-    return pool
+    return ThreadPoolExecutor(count, "symview")
 
 
-os.register_at_fork(after_in_child=_workers.cache_clear)  # threads do not survive a fork
+def _forget() -> None:
+    """Threads do not survive a fork."""
+    _workers.cache_clear()
+    _callers.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 def in_threads[State, Task](
@@ -34,6 +37,8 @@ def in_threads[State, Task](
     count = max(1, min(torch.get_num_threads(), len(tasks)))
 
     def run(thread: int) -> State:
+        if count > 1:
+            torch.set_num_threads(1)  # and MKL's, which is the process's: products would start threads in threads
         with torch.inference_mode():
             state = make()
             for task in tasks[thread::count]:
@@ -43,8 +48,10 @@ def in_threads[State, Task](
     if count == 1:
         return [run(0)]
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # MKL has one number for all threads: with more, every product would start threads again
+    _callers.add(threading.get_ident())
     try:
         return list(_workers(count).map(run, range(count)))
     finally:
-        torch.set_num_threads(threads)
+        _callers.discard(threading.get_ident())
+        if not _callers:
+            torch.set_num_threads(threads)

@@ -40,7 +40,7 @@ SMALL = {
         "--policy.pretrained_backbone_weights": "null",
         "--policy.horizon": 8,
         "--policy.n_action_steps": 4,
-        "--policy.drop_n_last_frames": 1,
+        "--policy.drop_n_last_frames": 3,
         "--policy.down_dims": "[16, 32]",
     },
     "lerobot-eval": EVALUATION,

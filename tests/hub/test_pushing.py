@@ -30,7 +30,7 @@ from tests.lerobot_policy_symview.test_training import train
 STOCK = {  # as small as they go
     "act": ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32"]
     + ["--policy.pretrained_backbone_weights=null"],
-    "diffusion": ["--policy.horizon=8", "--policy.n_action_steps=4", "--policy.drop_n_last_frames=1"]
+    "diffusion": ["--policy.horizon=8", "--policy.n_action_steps=4", "--policy.drop_n_last_frames=3"]
     + ["--policy.down_dims=[16,32]", "--policy.num_train_timesteps=4"]
     + ["--policy.pretrained_backbone_weights=null"],
 }

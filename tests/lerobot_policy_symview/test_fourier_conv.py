@@ -190,10 +190,11 @@ def test_python_threads_do_not_disturb_each_other():
     pairs = [layers(2, fields, 1) for fields in (2, 3)]
     images = [images_for(pair[0], batch=4, height=32, width=32) for pair in pairs]
     expected = [fast(given, True) for (_, fast), given in zip(pairs, images, strict=True)]
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(2,)) as pool:
         for _ in range(10):
             jobs = [pool.submit(fast, given, True) for (_, fast), given in zip(pairs, images, strict=True)]
             assert all(torch.equal(job.result(), out) for job, out in zip(jobs, expected, strict=True))
+        assert pool.submit(torch.get_num_threads).result() == 2
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

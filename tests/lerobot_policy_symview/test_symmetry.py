@@ -100,7 +100,7 @@ def test_a_declaration_of_another_size_is_refused_with_the_features_names():
     [
         (("x", "y", "z"), ["dx", "dz", "dy"], "'dz' as 'y', 'dy' as 'z'"),
         (("x:left", "y:left", "yaw"), ["y", "x", "yaw"], "'y' as 'x:left', 'x' as 'y:left'"),
-        (("aperture", "scalar", "sign"), ["scalar", "z", "rx"], "'rx' as 'sign'"),
+        (("aperture", "sign", "sign"), ["scalar", "yaw", "rx"], "'yaw' as 'sign', 'rx' as 'sign'"),
     ],
 )
 def test_kinds_that_contradict_the_features_names_are_refused(kinds, names, wrong):
@@ -112,7 +112,7 @@ def test_kinds_that_contradict_the_features_names_are_refused(kinds, names, wron
     ("kinds", "names"),
     [
         (("x", "y", "scalar"), ["dx", "dy", "dyaw"]),
-        (("sign", "z", "aperture"), ["yaw", "aperture", "dz"]),
+        (("yaw:arm", "z", "aperture"), ["dyaw", "aperture", "dz"]),
         (("x", "y", "z"), ["px", "py", "depth"]),
         (("x", "y"), None),
     ],
