@@ -65,7 +65,7 @@ def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
     Raises:
         ValueError: if the state that the policy declares is not that of the simulators.
     """
-    config.states.check(len(keys.STATE_NAMES), keys.STATE, keys.STATE_NAMES)
+    config.states.check(len(keys.STATE_NAMES), keys.STATE)
     if any(
         kind in keys.STATE_NAMES and kind != name
         for kind, name in zip(config.state_symmetry, keys.STATE_NAMES, strict=True)
