@@ -17,7 +17,6 @@ from lerobot_symview.camera import CalibrationError
 from lerobot_symview.cli import DatasetTarget, check_repo_id, run_command
 from lerobot_symview.derivation import (
     MADE_FROM,
-    PARTS_FORMAT,
     Derivation,
     cut_parts,
     derived_schema,
@@ -226,7 +225,6 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
             "left_out": derivation.dropped,
             "symview": version("lerobot_policy_symview"),
-            "parts": PARTS_FORMAT,
         }
     )
 

@@ -34,7 +34,6 @@ from lerobot_symview.views import View
 from lerobot_symview.workspace import Workspace
 
 PART_FRAMES = 200  # at least, where a file of the source has as many
-PARTS_FORMAT = 2  # of what an interrupted run leaves: 1 had its statistics as JSON
 MADE_FROM = "symview_views.json"  # in the result's `meta`
 
 
@@ -111,7 +110,7 @@ def cut_parts(source: SourceDataset) -> list[range]:
     parts: list[range] = []
     frames = 0
     for episode, row in enumerate(source.episodes):
-        if parts and frames < PART_FRAMES and source.data_file(episode) == source.data_file(parts[-1].start):
+        if parts and frames < PART_FRAMES and source.data_place(episode) == source.data_place(parts[-1].start):
             parts[-1] = range(parts[-1].start, episode + 1)
             frames += row["length"]
         else:

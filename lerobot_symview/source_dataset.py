@@ -93,8 +93,12 @@ class SourceDataset:
 
     def data_file(self, episode: int) -> Path:
         """Where an episode's table is."""
+        return self.folder / self.data_path(*self.data_place(episode))
+
+    def data_place(self, episode: int) -> tuple[int, int]:
+        """Chunk and file of an episode's table."""
         row = self.episodes[episode]
-        return self.folder / self.data_path(row["data/chunk_index"], row["data/file_index"])
+        return row["data/chunk_index"], row["data/file_index"]
 
     def data_path(self, chunk: int, file: int) -> str:
         """Path of a table, relative to the dataset."""
@@ -102,13 +106,13 @@ class SourceDataset:
 
     def first_row(self, episode: int) -> int:
         """Where an episode begins in its table's file."""
-        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_file(episode)]
+        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_place(episode)]
 
     @cached_property
-    def _file_starts(self) -> dict[Path, int]:
-        starts: dict[Path, int] = {}
+    def _file_starts(self) -> dict[tuple[int, int], int]:
+        starts: dict[tuple[int, int], int] = {}
         for episode, row in enumerate(self.episodes):
-            starts.setdefault(self.data_file(episode), row["dataset_from_index"])
+            starts.setdefault(self.data_place(episode), row["dataset_from_index"])
         return starts
 
     def video_file(self, key: str, episode: int) -> Path:
@@ -127,8 +131,8 @@ class SourceDataset:
         """Raise a CommandError that names the files which `features` of every episode need and which are not there."""
         videos = [key for key in features if self.features[key]["dtype"] == "video"]
         files = {self.folder / "meta" / "stats.json": None}
+        files |= {self.folder / self.data_path(*place): None for place in self._file_starts}
         for episode in range(len(self.episodes)):
-            files[self.data_file(episode)] = None
             files |= dict.fromkeys(self.video_file(key, episode) for key in videos)
         missing = [str(file.relative_to(self.folder)) for file in files if not file.is_file()]
         if missing:

@@ -91,7 +91,7 @@ class PlainNetwork(nn.Module):
         """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
         planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
         features = torch.cat([picture, planes], dim=1)
-        if torch.is_autocast_enabled(features.device.type) or features.is_cuda or picture.dtype == torch.bfloat16:
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as ours
             features = features.contiguous(memory_format=torch.channels_last)
         for layer, pool in zip(self.layers, self.pooled, strict=True):
             features = layer(features)
@@ -131,6 +131,8 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
         "train_step_floor_s": _dense_operations(plain, config) / _operations_per_second(config),
     }
     del networks["escnn_"]
+    if "plain_bfloat16_" in networks:  # converted once, not at every call
+        networks["plain_bfloat16_"] = (deepcopy(plain).to(torch.bfloat16), "bfloat16")
     for batch in (1, 5):
         seen = _input(config, policy, batch)
         calls = {name: _inference(network.eval(), *seen, dtype) for name, (network, dtype) in networks.items()}
@@ -188,13 +190,9 @@ def _training_step(network: nn.Module, picture: Tensor, state: Tensor, dtype: st
 
 
 def _inference(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
-    if isinstance(network, PlainNetwork):  # converted once, not at every call as by autocast
-        kind = getattr(torch, dtype)
-        network, picture, state = deepcopy(network).to(kind), picture.to(kind), state.to(kind)
-
     def run() -> None:
-        reduced = dtype == "bfloat16" and not isinstance(network, PlainNetwork)
-        with torch.inference_mode(), torch.autocast(picture.device.type, torch.bfloat16, enabled=reduced):
+        reduced = torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
+        with torch.inference_mode(), reduced:
             network(picture, state)
 
     return run

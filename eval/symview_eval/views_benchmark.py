@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import shutil
 import statistics
 import tempfile
@@ -205,15 +204,12 @@ def _offline(frames: int, rounds: int) -> dict[str, float]:
             return taken
 
         add(recorded)  # imports and compiled kernels are loaded before the clocks start
-        gc.collect()
-        gc.freeze()  # a simulator and PyTorch, which the command does not load, would be searched for garbage
         for _ in range(rounds):
             with _codec_clocks() as clocks:
                 alone = add(source)
             found["offline_codec_share"].append(sum(clock.milliseconds for clock in clocks) / 1000 / alone)
             found["offline_two_process_speedup"].append(alone / add(source, num_workers=2))
             found["frames_per_s"].append(total / alone)
-    gc.unfreeze()
     return {key: value for name, values in found.items() for key, value in _median_and_quartiles(name, values).items()}
 
 

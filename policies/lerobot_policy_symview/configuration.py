@@ -173,8 +173,7 @@ class SymviewConfig(PreTrainedConfig):
                 "--policy.augmentation=group moves nothing with --policy.group=C1: "
                 "use --policy.augmentation=d4, so2 or o2"
             )
-        has_yaw = any(entry.split(":")[0] == "yaw" for entry in self.state_symmetry)
-        if self.gripper_input == "none" or not has_yaw:
+        if self.gripper_input == "none" or not self.states.of_kind("yaw"):
             raise ValueError(
                 f"--policy.augmentation={self.augmentation} turns the gripper with the scene, but its yaw does not "
                 f"enter the network with --policy.gripper_input={self.gripper_input} and --policy.state_symmetry="

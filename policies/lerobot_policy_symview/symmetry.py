@@ -142,7 +142,7 @@ class Symmetry:
     @cached_property
     def signs(self) -> list[int]:
         """Indices of the entries that mirror images negate."""
-        return [i for i, entry in enumerate(self.entries) if entry.split(":")[0] in ("yaw", "sign")]
+        return sorted(self.of_kind("yaw") + self.of_kind("sign"))
 
     @cached_property
     def shared_scales(self) -> list[int]:
@@ -202,8 +202,7 @@ class Symmetry:
 
 def _can_be(name: str, kind: str) -> bool:
     """Whether an entry called `name` may be declared as `kind`: not if it is a kind that moves otherwise."""
-    alike = {"z": "scalar", "aperture": "scalar"}
-    return name not in KINDS or kind == "scalar" or alike.get(name, name) == alike.get(kind, kind)
+    return name not in KINDS or kind in (name, "scalar") or {name, kind} <= {"z", "aperture", "scalar"}
 
 
 def _named(kind: str, name: str) -> str:

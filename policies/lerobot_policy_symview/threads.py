@@ -34,23 +34,25 @@ def in_threads[State, Task](
 
     Which thread has which task follows from their numbers alone, so that what a thread sums up is the same every time.
     """
-    count = max(1, min(torch.get_num_threads(), len(tasks)))
+    threads = torch.get_num_threads()
+    count = max(1, min(threads, len(tasks)))
 
     def run(thread: int) -> State:
-        if count > 1:
-            torch.set_num_threads(1)  # and MKL's, which is the process's: products would start threads in threads
         with torch.inference_mode():
             state = make()
             for task in tasks[thread::count]:
                 work(state, task)
             return state
 
+    def run_alone(thread: int) -> State:
+        torch.set_num_threads(1)  # and MKL's, which is the process's: products would start threads in threads
+        return run(thread)
+
     if count == 1:
         return [run(0)]
-    threads = torch.get_num_threads()
     _callers.add(threading.get_ident())
     try:
-        return list(_workers(count).map(run, range(count)))
+        return list(_workers(count).map(run_alone, range(count)))
     finally:
         _callers.discard(threading.get_ident())
         if not _callers:
