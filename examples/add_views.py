@@ -14,8 +14,8 @@ from torchvision.transforms.functional import resize
 from torchvision.utils import save_image
 
 from lerobot_symview import PerspectiveView, ReprojectedView, Workspace, keys
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDataset, remove_feature
 
 from lerobot_symview import CameraSpec, PerspectiveView, ReprojectedView, keys
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.calibration import read_calibration
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 

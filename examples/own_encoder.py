@@ -16,11 +16,11 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor, nn
 
 from lerobot_policy_symview import SymviewBcConfig
-from lerobot_policy_symview.encoder import Encoder
 from lerobot_policy_symview.equivariance import equivariance_errors
-from lerobot_policy_symview.groups import PlanarGroup
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_symview.names import added
+from lerobot_policy_symview.nn.encoders.base import Encoder
+from lerobot_policy_symview.symmetry.groups import PlanarGroup
+from lerobot_symview.registry import added
 
 logger = logging.getLogger(__name__)
 

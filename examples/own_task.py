@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint
 
 import numpy as np
 
-from lerobot_symview.names import added
+from lerobot_symview.registry import added
 from symview_sim.demonstration import demonstrate
 from symview_sim.grasping import CLEARANCE, carry, grasp
 from symview_sim.scene import Scene

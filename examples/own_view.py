@@ -16,8 +16,8 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import Frame, keys, make_view, register_view
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import CameraSpec, keys
-from lerobot_symview.placement import CameraSpread
+from lerobot_symview.geometry.placement import CameraSpread
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 

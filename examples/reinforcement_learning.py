@@ -11,7 +11,7 @@ import logging
 from pathlib import Path
 
 from lerobot_policy_symview import SymviewSacfdConfig
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import EnvSettings, NewDataset

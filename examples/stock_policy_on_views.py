@@ -21,8 +21,8 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_policy_symview import SymviewEnvConfig
 from lerobot_symview import ReprojectedView
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 

@@ -15,9 +15,9 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.rollouts import EVALUATION_SEED, Actor, evaluate, observed
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.hub import PushedDataset
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, observed
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.simulators import Simulators

@@ -4,9 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lerobot_symview.camera import CalibrationError as CalibrationError
-    from lerobot_symview.camera import Camera as Camera
-    from lerobot_symview.placement import CameraSpec as CameraSpec
+    from lerobot_symview.geometry.camera import CalibrationError as CalibrationError
+    from lerobot_symview.geometry.camera import Camera as Camera
+    from lerobot_symview.geometry.placement import CameraSpec as CameraSpec
+    from lerobot_symview.geometry.workspace import Workspace as Workspace
     from lerobot_symview.views import VIEWS as VIEWS
     from lerobot_symview.views import Frame as Frame
     from lerobot_symview.views import PerspectiveView as PerspectiveView
@@ -14,14 +15,13 @@ if TYPE_CHECKING:
     from lerobot_symview.views import View as View
     from lerobot_symview.views import make_view as make_view
     from lerobot_symview.views import register_view as register_view
-    from lerobot_symview.workspace import Workspace as Workspace
 
 # Loaded when they are asked for: views need OpenCV, which a simulator's process can do without.
 _HOMES = {
-    "camera": ("CalibrationError", "Camera"),
-    "placement": ("CameraSpec",),
+    "geometry.camera": ("CalibrationError", "Camera"),
+    "geometry.placement": ("CameraSpec",),
     "views": ("VIEWS", "Frame", "PerspectiveView", "ReprojectedView", "View", "make_view", "register_view"),
-    "workspace": ("Workspace",),
+    "geometry.workspace": ("Workspace",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

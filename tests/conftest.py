@@ -23,10 +23,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
-from lerobot_symview.hub import PushedDataset
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 

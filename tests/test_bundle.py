@@ -46,7 +46,7 @@ def test_what_is_left_out_is_not_imported(tmp_path):
 
 def test_our_own_packages_go_along_whole():
     found = places("lerobot_policy_symview")
-    assert {"symview_sim/env.py", "lerobot_symview/views.py", "symview_eval/experiments/paper/table1.csv"} <= found
+    assert {"symview_sim/env.py", "lerobot_symview/views/base.py", "symview_eval/experiments/paper/table1.csv"} <= found
     assert "symview_eval/templates/demo.html" in found
     assert any(place.endswith("dist-info/entry_points.txt") for place in found)
 

@@ -6,7 +6,7 @@ import pytest
 from lerobot.scripts import lerobot_eval, lerobot_train
 
 from symview_eval.demo import REPO_ID, DemoConfig, demo, evaluate_command, train_command
-from symview_eval.report import read_success
+from symview_eval.demo_report import read_success
 
 
 @pytest.mark.slow

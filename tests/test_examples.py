@@ -13,7 +13,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from lerobot_symview import names
+from lerobot_symview import registry
 from lerobot_symview.views import VIEWS
 from symview_sim.env import SymviewEnv
 from tests.hub.client import online
@@ -117,7 +117,7 @@ def without_trace():
     handlers, level = root.handlers[:], root.level
     with mock.patch.dict(VIEWS):
         yield
-    names.added.cache_clear()
+    registry.added.cache_clear()
     root.handlers[:], root.level = handlers, level
 
 

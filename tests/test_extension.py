@@ -7,9 +7,9 @@ from textwrap import dedent
 import pytest
 from lerobot.scripts import lerobot_eval
 
-from lerobot_symview import names
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview import registry
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.lerobot_policy_symview.test_training import train
@@ -21,7 +21,7 @@ MODULE = """
     import cv2
     import torch
 
-    from lerobot_policy_symview.encoder import Encoder
+    from lerobot_policy_symview.nn.encoders.base import Encoder
     from symview_sim.tasks.block_picking import BlockPicking
 
 
@@ -67,7 +67,7 @@ def other_package(tmp_path, monkeypatch):
     install(site, "other_package", ENTRY_POINTS, monkeypatch)
     (site / "other_package.py").write_text(dedent(MODULE))
     yield
-    names.added.cache_clear()
+    registry.added.cache_clear()
     sys.modules.pop("other_package", None)
 
 

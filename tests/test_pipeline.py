@@ -12,7 +12,7 @@ import pytest
 from lerobot.scripts import lerobot_eval, lerobot_train
 
 from symview_eval.demo import DemoConfig, demo
-from symview_eval.report import read_losses, read_success
+from symview_eval.demo_report import read_losses, read_success
 
 pytestmark = pytest.mark.long
 BIN = Path(sys.executable).parent

@@ -11,10 +11,10 @@ COMMANDS = {
     "lerobot-train": "lerobot.scripts.lerobot_train",
     "lerobot-eval": "lerobot.scripts.lerobot_eval",
     "symview-generate": "symview_sim.generate",
-    "symview-add-views": "lerobot_symview.add_views",
+    "symview-add-views": "lerobot_symview.datasets.add_views",
     "symview-train-rl": "lerobot_policy_symview.rl.train_rl",
     "symview-experiment": "symview_eval.experiments.experiment",
-    "symview-benchmark": "symview_eval.benchmark",
+    "symview-benchmark": "symview_eval.benchmarks.benchmark",
 }
 MODULES = ", ".join([*COMMANDS.values(), "symview_eval.experiments.cells"])
 CHECK = f"import pybullet, {MODULES}; print(pybullet.isNumpyEnabled())"

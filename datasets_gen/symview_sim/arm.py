@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lerobot_symview.camera import Array
+from lerobot_symview.geometry.camera import Array
 from symview_sim.bullet import pybullet, silenced
 from symview_sim.motions import nearest_turn
 from symview_sim.robots import RobotSpec

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
 

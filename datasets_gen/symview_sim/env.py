@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.camera import Camera
-from lerobot_symview.names import lookup
-from lerobot_symview.placement import CameraSpec, top_camera
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.placement import CameraSpec, top_camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.registry import lookup
 from symview_sim.depth_sensor import degrade
 from symview_sim.motions import MAX_STEP, MAX_TURN
 from symview_sim.rendering import Picture, render

@@ -12,13 +12,13 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.camera import project
-from lerobot_symview.cli import run_command
-from lerobot_symview.executors import EXECUTORS
-from lerobot_symview.features import Features, camera_features
-from lerobot_symview.hub import push_dataset
-from lerobot_symview.names import lookup
-from lerobot_symview.staging import is_complete, open_partial, partial_folder, remove_partial
+from lerobot_symview.datasets.features import Features, camera_features
+from lerobot_symview.datasets.hub import push_dataset
+from lerobot_symview.geometry.camera import project
+from lerobot_symview.registry import lookup
+from lerobot_symview.runtime.cli import run_command
+from lerobot_symview.runtime.executors import EXECUTORS
+from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, remove_partial
 from symview_sim.env import SymviewEnv
 from symview_sim.recording import (
     MADE_FROM,

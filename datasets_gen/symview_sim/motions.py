@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_symview.camera import Array
+from lerobot_symview.geometry.camera import Array
 
 MAX_STEP = 0.05  # metres per action and axis
 MAX_TURN = np.pi / 4  # radians per action

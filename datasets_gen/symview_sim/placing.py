@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_symview.camera import Array
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.workspace import Workspace
 
 TRIES = 10_000
 

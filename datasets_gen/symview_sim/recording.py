@@ -24,8 +24,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lerobot_symview.features import Features
-from lerobot_symview.staging import disk_errors, part_of, plain
+from lerobot_symview.datasets.features import Features
+from lerobot_symview.runtime.staging import disk_errors, part_of, plain
 from symview_sim.demonstration import Episode, demonstrate
 from symview_sim.settings import EnvSettings
 

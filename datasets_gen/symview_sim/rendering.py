@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.camera import Array, Camera, invert_rigid
+from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
 from symview_sim.bullet import pybullet
 
 NEAR, FAR = 0.05, 4.0  # metres, clipping planes

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pybullet_data
 
-from lerobot_symview.camera import Array
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.arm import Arm
 from symview_sim.bullet import connect, disconnect, pybullet
 from symview_sim.robots import RobotSpec

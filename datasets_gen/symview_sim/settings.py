@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from lerobot_symview.cli import DatasetTarget
-from lerobot_symview.hub import HubOptions
-from lerobot_symview.names import lookup
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.datasets.hub import HubOptions
+from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.registry import lookup
+from lerobot_symview.runtime.cli import DatasetTarget
 from symview_sim.robots import ROBOTS
 from symview_sim.tasks import check_task
 

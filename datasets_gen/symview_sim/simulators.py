@@ -23,11 +23,11 @@ import psutil
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_workspace
-from lerobot_symview.camera import stored_camera
-from lerobot_symview.cli import CommandError
+from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.geometry.camera import stored_camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, make_view
-from lerobot_symview.workspace import Workspace
 from symview_sim.env import Observation as RawObservation
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings

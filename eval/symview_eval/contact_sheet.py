@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_symview.camera import Camera, project
-from lerobot_symview.workspace import Workspace
+from lerobot_symview.geometry.camera import Camera, project
+from lerobot_symview.geometry.workspace import Workspace
 
 TILE, GAP, LABEL = 228, 8, 24  # pixels
 OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)

@@ -7,8 +7,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_symview.cli import run_command
-from symview_eval.report import write_report
+from lerobot_symview.runtime.cli import run_command
+from symview_eval.demo_report import write_report
 from symview_eval.stages import Stage, run_stages
 
 logger = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from lerobot_symview.cli import CommandError, run_command
+from lerobot_symview.runtime.cli import CommandError, run_command
 
 EXAMPLES = "  symview-doctor"
 
@@ -75,7 +75,7 @@ def check_torch() -> Finding:
 
 def check_escnn() -> Finding:
     """The benchmark compares with escnn, which must do without the dependencies it cannot build here."""
-    from lerobot_policy_symview.escnn_import import gspaces
+    from lerobot_policy_symview.nn.escnn_import import gspaces
 
     space = gspaces.flipRot2dOnR2(4)
     return Finding(f"escnn {importlib.metadata.version('escnn')} imports, {space.name}")

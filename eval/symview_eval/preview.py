@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.calibration import read_calibration
-from lerobot_symview.camera import Camera, project
-from lerobot_symview.cli import CommandError, DatasetTarget, run_command
-from lerobot_symview.features import Features, stored_workspace
-from lerobot_symview.source_dataset import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
+from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.datasets.features import Features, stored_workspace
+from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
+from lerobot_symview.geometry.camera import Camera, project
+from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget, run_command
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, choose_views
-from lerobot_symview.workspace import MINIMUM_VISIBLE, Workspace
 from symview_eval.contact_sheet import Row, grey, montage, page, with_outline
 from symview_eval.rerun_recording import RerunRecording
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.camera import depth_in_metres, unproject
-from lerobot_symview.cli import CommandError
+from lerobot_symview.geometry.camera import depth_in_metres, unproject
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame
-from lerobot_symview.workspace import Workspace
 
 FRUSTUM = 0.1  # metres, where a camera's image is drawn
 POINT_RADIUS = 0.002  # metres

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 
 logger = logging.getLogger(__name__)
 

@@ -9,14 +9,14 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.optim import AdamConfig, LRSchedulerConfig
 
-from lerobot_policy_symview.groups import GROUP_NAMES, make_group
 from lerobot_policy_symview.methods import METHODS
-from lerobot_policy_symview.symmetry import Symmetry, ThetaRepresentation
+from lerobot_policy_symview.symmetry.groups import GROUP_NAMES, make_group
+from lerobot_policy_symview.symmetry.representations import Symmetry, ThetaRepresentation
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_calibration, parse_workspace
-from lerobot_symview.names import added, lookup
+from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.registry import added, lookup
 from lerobot_symview.views import VIEWS, View, make_view
-from lerobot_symview.workspace import Workspace
 
 CAMERA_IMAGES = ("side", "top")  # views that are a camera's own image: nothing is computed
 ENCODER_NAMES = ("equivariant", "plain", "relaxed", "voxel", "point_cloud")
@@ -89,7 +89,7 @@ class SymviewConfig(PreTrainedConfig):
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Precision of convolutions, in training and evaluation; bfloat16 is for GPUs and for processors that have it."""
     state_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
-    """Kind of each entry of `observation.state`, see `lerobot_policy_symview.symmetry`."""
+    """Kind of each entry of `observation.state`, see `lerobot_policy_symview.symmetry.representations`."""
     action_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
     """Kind of each entry of `action`."""
     view_options: dict[str, Any] = field(default_factory=dict)

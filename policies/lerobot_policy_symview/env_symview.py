@@ -14,7 +14,7 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
 
 # What a simulator process imports; loaded once by the fork server instead of six seconds in each process.

@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lerobot_policy_symview.augmentation import move_images
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
-from lerobot_policy_symview.groups import PlanarGroup, make_group
-from lerobot_policy_symview.layers import autocast_dtype
+from lerobot_policy_symview.nn.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
-from lerobot_policy_symview.processors import make_processors
-from lerobot_policy_symview.symmetry import Motion
+from lerobot_policy_symview.processor_pipelines import make_processors
+from lerobot_policy_symview.symmetry.augmentation import move_images
+from lerobot_policy_symview.symmetry.groups import PlanarGroup, make_group
+from lerobot_policy_symview.symmetry.representations import Motion
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_workspace
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.geometry.placement import CameraSpec
 
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10, torch.bfloat16: 5e-2}
 LEAST_SCALE = 0.1

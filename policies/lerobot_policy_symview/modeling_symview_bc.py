@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
-from lerobot_policy_symview.heads import RegressionHead
-from lerobot_policy_symview.layers import asymmetry
+from lerobot_policy_symview.nn.heads import RegressionHead
+from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.policy import Network, SymviewPolicy
 from lerobot_symview import keys
 

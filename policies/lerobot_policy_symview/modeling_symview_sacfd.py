@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.heads import GaussianHead
+from lerobot_policy_symview.nn.heads import GaussianHead
 from lerobot_policy_symview.policy import Network, SymviewPolicy
 
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)

@@ -16,21 +16,21 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lerobot_policy_symview.augmentation import AUGMENTATIONS, crop, move_images, random_motion, scale_down
-from lerobot_policy_symview.clouds import cloud_from_depth
 from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
-from lerobot_policy_symview.encoders import make_encoder
-from lerobot_policy_symview.groups import make_group
+from lerobot_policy_symview.inputs.clouds import cloud_from_depth
+from lerobot_policy_symview.inputs.state import StateInput, camera_directions
+from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.model_card import model_card
-from lerobot_policy_symview.point_encoder import POINTS
-from lerobot_policy_symview.processor_files import check_processor_files
+from lerobot_policy_symview.nn.encoders.convolutional import make_encoder
+from lerobot_policy_symview.nn.encoders.point_cloud import POINTS
+from lerobot_policy_symview.processor_allowlist import check_processor_files
 from lerobot_policy_symview.processor_views import metres_of_depth, metres_of_heights
-from lerobot_policy_symview.state_input import StateInput, camera_directions
-from lerobot_policy_symview.symmetry import Motion, Symmetry
-from lerobot_policy_symview.voxels import voxelize
+from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, crop, move_images, random_motion, scale_down
+from lerobot_policy_symview.symmetry.groups import make_group
+from lerobot_policy_symview.symmetry.representations import Motion, Symmetry
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_calibration, parse_workspace
-from lerobot_symview.gripper import gripper_image
+from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.views import ReprojectedView
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]

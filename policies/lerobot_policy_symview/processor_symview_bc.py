@@ -1,5 +1,5 @@
 """The processors of `symview_bc`, where LeRobot looks for them."""
 
-from lerobot_policy_symview.processors import make_processors as make_symview_bc_pre_post_processors
+from lerobot_policy_symview.processor_pipelines import make_processors as make_symview_bc_pre_post_processors
 
 __all__ = ["make_symview_bc_pre_post_processors"]

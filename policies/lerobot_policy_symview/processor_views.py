@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_calibration, parse_workspace
-from lerobot_symview.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
+from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.geometry.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
 from lerobot_symview.views import Frame, View, make_view
 
 if TYPE_CHECKING:
-    from lerobot_symview.batched import FrameBatch
+    from lerobot_symview.views.torch_backend import FrameBatch
 
 METRES_AT_MOST = 10.0  # nothing on a table is as far or as high, and nothing that is seen is within as many millimetres
 
@@ -79,7 +79,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         views: name -> options of every view wanted, as for `lerobot_symview.views.make_view`.
         camera: the camera they are made from.
         workspace: constructor arguments of `Workspace`; by default the calibration's, or the default one.
-        calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
+        calibration: content of a calibration file (`lerobot_symview.calibration.file`), or nothing.
         gripper: which entries of `observation.state` are the gripper's x, y, z, yaw and aperture.
     """
 
@@ -126,7 +126,9 @@ class ViewsProcessorStep(ObservationProcessorStep):
     def _batch(
         self, observation: RobotObservation, views: list[str], needs_depth: bool, needs_gripper: bool
     ) -> FrameBatch:
-        from lerobot_symview.batched import FrameBatch  # needs numba, which a plugin's import must not wait for
+        from lerobot_symview.views.torch_backend import (
+            FrameBatch,  # needs numba, which a plugin's import must not wait for
+        )
 
         color, depth = keys.rgb(self.camera), keys.depth(self.camera)
         needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if needs_gripper else [])
@@ -172,7 +174,7 @@ def _matrices(key: str, stated: Tensor, side: int, count: int) -> NDArray[np.flo
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """Return each output for all frames, on their device: together by CUDA, by the compiled kernels elsewhere."""
-    from lerobot_symview.batched import can_batch, render_batch
+    from lerobot_symview.views.torch_backend import can_batch, render_batch
 
     device = batch.rgb.device
     if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which the bits depend on

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from lerobot.datasets import LeRobotDataset, remove_feature
 
-from lerobot_symview import keys, names
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview import keys, registry
+from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
@@ -51,7 +51,7 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
         hub.users[ALICE] = (page.stem, {page.stem})
         yield page, reader
     shutil.rmtree(reader.dataset(""), ignore_errors=True)
-    names.added.cache_clear()
+    registry.added.cache_clear()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from lerobot_policy_symview.processors import make_processors
+from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.hostile.files import DATA
 from tests.lerobot_policy_symview.policies import make_policy
 

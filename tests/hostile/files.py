@@ -14,8 +14,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.replay import Replay, ReplayConfig
 from lerobot_symview import keys
-from lerobot_symview.add_views import add_views
-from lerobot_symview.cli import DatasetTarget
+from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.runtime.cli import DatasetTarget
 from symview_eval.preview import PreviewConfig, preview
 from tests.lerobot_symview.derived import views_config
 

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from lerobot_policy_symview.demonstrations import open_dataset
-from lerobot_symview.calibration import read_calibration
-from lerobot_symview.camera import CalibrationError
-from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_policy_symview.rl.demonstrations import open_dataset
+from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
 from tests.hostile.files import (
     both_commands,
     change_info,

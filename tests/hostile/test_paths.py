@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lerobot_policy_symview.demonstrations import open_dataset
-from lerobot_symview.cli import CommandError, DatasetTarget
+from lerobot_policy_symview.rl.demonstrations import open_dataset
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
 from tests.hostile.files import (
     DATA,
     EPISODES,

@@ -10,8 +10,8 @@ import torch
 from safetensors import SafetensorError
 
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_symview.calibration import read_calibration
-from lerobot_symview.cli import CommandError
+from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.runtime.cli import CommandError
 from tests.hostile.files import saved_replay
 
 ROOT = Path(__file__).parents[2]

@@ -10,7 +10,7 @@ from lerobot.processor import ProcessorStepRegistry, tokenizer_processor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.processors import make_processors
+from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.hostile.files import change_json, load_with_processors
 from tests.lerobot_policy_symview.policies import make_config
 

@@ -13,10 +13,10 @@ from safetensors import SafetensorError
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
-from lerobot_symview.calibration import parse_workspace
-from lerobot_symview.camera import CalibrationError
-from lerobot_symview.cli import CommandError
-from lerobot_symview.source_dataset import SourceDataset
+from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.conftest import make_camera

@@ -17,9 +17,9 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
-from lerobot_symview.add_views import AddViewsConfig, add_views
-from lerobot_symview.cli import CommandError
-from lerobot_symview.hub import PushedDataset, push_dataset
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset, push_dataset
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE

@@ -4,7 +4,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview import SymviewEnvConfig
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim import TASK_NAMES
 from symview_sim.env import SymviewEnv
 

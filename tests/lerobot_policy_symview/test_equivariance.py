@@ -17,7 +17,7 @@ from lerobot_policy_symview.equivariance import (
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
-from lerobot_policy_symview.symmetry import Motion
+from lerobot_policy_symview.symmetry.representations import Motion
 from lerobot_symview import keys
 from symview_sim.env import SymviewEnv
 from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch

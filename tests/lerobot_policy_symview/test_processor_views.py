@@ -6,13 +6,13 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
+from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres_of_depth, metres_of_heights
-from lerobot_policy_symview.processors import make_processors
-from lerobot_policy_symview.rollouts import observed as simulated
+from lerobot_policy_symview.rl.rollouts import observed as simulated
 from lerobot_symview import keys
-from lerobot_symview.camera import CalibrationError, depth_in_metres, stored_camera
+from lerobot_symview.geometry.camera import CalibrationError, depth_in_metres, stored_camera
+from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view
-from lerobot_symview.workspace import Workspace
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.settings import EnvSettings
@@ -172,7 +172,7 @@ def test_devices_without_float64_leave_the_views_to_the_cpu(observed, monkeypatc
     def refuse(*_):
         raise AssertionError("float64 on an Apple GPU")
 
-    monkeypatch.setattr("lerobot_symview.batched.render_batch", refuse)
+    monkeypatch.setattr("lerobot_symview.views.torch_backend.render_batch", refuse)
     key = keys.rgb("side")
     elsewhere = observed | {key: observed[key].as_subclass(ElsewhereTensor)}
     made, expected = (ViewsProcessorStep(views=OPTIONS).observation(one) for one in (elsewhere, dict(observed)))

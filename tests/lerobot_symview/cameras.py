@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
 
 CENTRE = np.array([0.45, 0.0])
 SHAPE = (40, 56)  # rows, columns: not square, so that mixing them up shows

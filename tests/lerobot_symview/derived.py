@@ -3,8 +3,8 @@
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_symview.add_views import AddViewsConfig
-from lerobot_symview.hub import PushedDataset
+from lerobot_symview.datasets.add_views import AddViewsConfig
+from lerobot_symview.datasets.hub import PushedDataset
 from tests.conftest import VIEW_SIZE
 
 

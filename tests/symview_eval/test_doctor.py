@@ -2,7 +2,7 @@ import importlib.metadata
 
 import pytest
 
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_eval import doctor
 
 

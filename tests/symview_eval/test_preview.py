@@ -3,12 +3,12 @@ import logging
 import numpy as np
 import pytest
 
-from lerobot_symview.add_views import add_views
-from lerobot_symview.camera import Camera, intrinsics_from_fov, orbit_pose
-from lerobot_symview.cli import CommandError, DatasetTarget
-from lerobot_symview.source_dataset import SourceDataset
+from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
 from lerobot_symview.views import make_view
-from lerobot_symview.workspace import Workspace
 from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
 from symview_eval.preview import PreviewConfig, preview, read_moments, table_resolution
 from tests.conftest import make_camera
@@ -121,7 +121,7 @@ def test_a_lower_camera_resolves_less():
 def test_the_outline_passes_through_the_corners():
     camera = make_camera(45.0)
     drawn = with_outline(np.zeros((152, 152, 3), dtype=np.uint8), camera, Workspace())
-    from lerobot_symview.camera import project
+    from lerobot_symview.geometry.camera import project
 
     scale = drawn.shape[0] // 152
     for u, v in project(Workspace().corners(), camera)[0]:

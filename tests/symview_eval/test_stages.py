@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_eval.stages import Stage, run_stages
 
 PYTHON = Path(sys.executable).name

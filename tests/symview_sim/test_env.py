@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from lerobot_symview.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from symview_sim import TASK_NAMES, gym_id
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv

@@ -14,8 +14,8 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import keys
-from lerobot_symview.cli import CommandError
-from lerobot_symview.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
@@ -234,7 +234,7 @@ def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monk
 
 
 def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
-    from lerobot_symview.executors import ProcessExecutor
+    from lerobot_symview.runtime.executors import ProcessExecutor
 
     with (
         ProcessExecutor(1, "symview_sim.recording") as executor,

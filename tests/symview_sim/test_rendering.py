@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from lerobot_symview.camera import project, unproject
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.geometry.camera import project, unproject
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.views import Frame, make_view
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
@@ -15,7 +15,7 @@ BOX = np.array([0.30, 0.24, 0.04])
 
 @pytest.fixture(scope="module")
 def scene():
-    from lerobot_symview.workspace import Workspace
+    from lerobot_symview.geometry.workspace import Workspace
 
     scene = Scene(ROBOTS["panda"], Workspace())
     scene.reset(np.array([0.3, 0.0, 0.24]), 0.0)

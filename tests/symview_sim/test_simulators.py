@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_symview import keys
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observed, Reset, Simulators, Step
 
@@ -34,9 +34,9 @@ def assert_same(actual, expected):
 
 
 def test_observations_are_what_the_environment_and_the_view_say(simulators):
-    from lerobot_symview.camera import stored_camera
+    from lerobot_symview.geometry.camera import stored_camera
+    from lerobot_symview.geometry.workspace import Workspace
     from lerobot_symview.views import Frame, ReprojectedView
-    from lerobot_symview.workspace import Workspace
     from symview_sim.env import named_features
 
     outcome = run(simulators, 0, Reset(7))

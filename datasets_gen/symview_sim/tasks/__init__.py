@@ -9,7 +9,7 @@ import importlib
 import pkgutil
 from typing import TYPE_CHECKING
 
-from lerobot_symview.names import added, lookup
+from lerobot_symview.registry import added, lookup
 
 if TYPE_CHECKING:
     from symview_sim.tasks.base import Task

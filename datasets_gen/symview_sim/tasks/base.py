@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lerobot_symview.camera import Array
+from lerobot_symview.geometry.camera import Array
 from symview_sim.scene import Scene
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lerobot_symview.camera import Array
+from lerobot_symview.geometry.camera import Array
 from symview_sim.grasping import LIFT, OPEN, carry, grasp
 from symview_sim.placing import random_places
 from symview_sim.scene import Scene

@@ -16,13 +16,13 @@ from pathlib import Path
 import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.demonstrations import open_dataset
 from lerobot_policy_symview.rl.checkpoints import last_checkpoint
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
-from lerobot_symview.cli import CommandError
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.runtime.cli import CommandError
 from symview_eval.experiments.cloning import clone
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.demonstrations import observations
-from lerobot_policy_symview.frames import FrameCodec
+from lerobot_policy_symview.inputs.observation_codec import FrameCodec
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_policy_symview.rl.demonstrations import observations
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
 from lerobot_symview import keys
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Times

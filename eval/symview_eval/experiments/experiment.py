@@ -12,9 +12,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_symview.cli import CommandError, run_command, subcommand
-from lerobot_symview.executors import EXECUTORS
-from lerobot_symview.names import lookup
+from lerobot_symview.registry import lookup
+from lerobot_symview.runtime.cli import CommandError, run_command, subcommand
+from lerobot_symview.runtime.executors import EXECUTORS
 from symview_eval.experiments.grid import EXPERIMENTS, Cell, select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import finished, unfinished

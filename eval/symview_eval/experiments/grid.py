@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from lerobot_symview.names import lookup
+from lerobot_symview.registry import lookup
 from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 

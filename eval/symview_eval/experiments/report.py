@@ -10,7 +10,7 @@ from pathlib import Path
 
 import jinja2
 
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_eval.contact_sheet import data_uri
 from symview_eval.experiments.grid import EXPERIMENTS, Experiment
 from symview_eval.experiments.scale import SCALES, Scale

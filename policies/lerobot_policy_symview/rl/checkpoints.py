@@ -22,12 +22,12 @@ from lerobot.utils.random_utils import load_rng_state, save_rng_state
 from safetensors.torch import load_model
 
 from lerobot_policy_symview.model_card import model_card
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
 from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.training import Episode, Interval, Training
-from lerobot_symview.cli import CommandError
-from lerobot_symview.hub import hub_errors
-from lerobot_symview.staging import part_of
+from lerobot_symview.datasets.hub import hub_errors
+from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.runtime.staging import part_of
 
 logger = logging.getLogger(__name__)
 

@@ -14,10 +14,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_policy_symview.critic import Critic
-from lerobot_policy_symview.frames import FrameCodec
-from lerobot_policy_symview.layers import asymmetry
+from lerobot_policy_symview.inputs.observation_codec import FrameCodec
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
+from lerobot_policy_symview.nn.critic import Critic
+from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.rl.replay import Sample
 
 WEIGHTS = "learner.safetensors"

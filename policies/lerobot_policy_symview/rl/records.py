@@ -8,7 +8,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 
 STEP = "step"
 

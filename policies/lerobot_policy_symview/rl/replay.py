@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_policy_symview.frames import Frame
+from lerobot_policy_symview.inputs.observation_codec import Frame
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from lerobot_policy_symview.demonstrations import open_dataset
 from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, push_policy, restore, save_checkpoint
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.learner import MEASURES
 from lerobot_policy_symview.rl.records import Records
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.training import Interval, Training
-from lerobot_symview.cli import run_command
+from lerobot_symview.runtime.cli import run_command
 
 logger = logging.getLogger(__name__)
 

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_policy_symview.demonstrations import check_scene, observations, outcomes, ranges
-from lerobot_policy_symview.frames import Frame
+from lerobot_policy_symview.inputs.observation_codec import Frame
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.demonstrations import check_scene, observations, outcomes, ranges
 from lerobot_policy_symview.rl.learner import Learner
 from lerobot_policy_symview.rl.replay import Replay
-from lerobot_policy_symview.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from symview_sim.simulators import Observation, Outcome, Reset, Simulators, Step
 
 EXPERT = 0  # the stream of the demonstrations; simulator i has the stream i + 1

@@ -13,20 +13,20 @@ from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.demonstrations import open_dataset, outcomes
 from lerobot_policy_symview.equivariance import assert_equivariant
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
-from lerobot_policy_symview.rl.configuration import TrainRlConfig
+from lerobot_policy_symview.rl.demonstrations import open_dataset, outcomes
 from lerobot_policy_symview.rl.learner import WEIGHTS
 from lerobot_policy_symview.rl.records import read_table
 from lerobot_policy_symview.rl.replay import ReplayConfig
+from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
-from lerobot_symview.cli import CommandError
-from lerobot_symview.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.lerobot_policy_symview.test_training import train
 

@@ -13,7 +13,7 @@ import pytest
 from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_symview.rl.checkpoints import describe
-from lerobot_symview.cli import CommandError
+from lerobot_symview.runtime.cli import CommandError
 from symview_eval.experiments import cells as cells_module
 from symview_eval.experiments import experiment
 from symview_eval.experiments.experiment import ExperimentConfig, run_experiment

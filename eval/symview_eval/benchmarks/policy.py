@@ -1,0 +1,271 @@
+"""What training and running the equivariant policy costs, beside escnn and an ordinary network of the same widths."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import Tensor, nn
+from torch.nn import functional
+from tqdm import tqdm
+
+from lerobot_policy_symview.configuration import CROP_SIZES
+from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.nn.encoders.convolutional import ImageEncoder
+from lerobot_symview import keys
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+
+LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
+PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"
+LOADED_EPISODES = 4
+MARGIN = 24  # pixels that the random crop may choose among: the paper's 152 for 128
+
+
+@dataclass(frozen=True)
+class PolicyBenchmark:
+    """Training steps, inference, start and data loading of symview_bc, as ratios of one run."""
+
+    batch_size: int = 128
+    """Samples per training step."""
+    width: int = 64
+    """Regular fields n of the network."""
+    crop_size: int = 128
+    """Pixels the network sees."""
+    repeats: int = 3
+    """Training steps of each network; medians are taken. Inference is repeated ten times as often."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Precision of our convolutions. escnn's are in float32, the ordinary network's in whichever is faster."""
+    device: str = "cpu"
+    """What the networks run on, such as `cuda`; data is loaded by the processor."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        for name in ("batch_size", "repeats"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.crop_size not in CROP_SIZES:
+            raise ValueError(f"--crop_size must be one of {CROP_SIZES}, got {self.crop_size}")
+        if self.dtype not in ("float32", "bfloat16"):
+            raise ValueError(f"--dtype must be float32 or bfloat16, got {self.dtype}")
+        try:
+            torch.empty(0, device=self.device)
+        except (AssertionError, RuntimeError) as error:
+            raise ValueError(f"--device={self.device} cannot be used here: {error}") from None
+
+
+class PlainNetwork(nn.Module):
+    """Ordinary convolutions of an encoder's expanded widths, with its filters as they are at the time.
+
+    Training it is what dense execution of the equivariant network would cost if expanding filters were free; running it
+    is the network with its filters expanded once.
+    """
+
+    def __init__(self, encoder: ImageEncoder):
+        super().__init__()
+        self.pooled = encoder.pooled
+        self.layers = nn.ModuleList()
+        for layer in encoder.layers:
+            with torch.no_grad():
+                weight, bias = layer.expanded()  # type: ignore[operator]
+            outputs, inputs = weight.shape[:2]
+            dense = nn.Conv2d(inputs, outputs, 3, padding=layer.padding)  # type: ignore[arg-type]
+            dense.load_state_dict({"weight": weight.reshape(outputs, inputs, 3, 3), "bias": bias})
+            self.layers.append(dense)
+
+    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
+        """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
+        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
+        features = torch.cat([picture, planes], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as ours
+            features = features.contiguous(memory_format=torch.channels_last)
+        for layer, pool in zip(self.layers, self.pooled, strict=True):
+            features = layer(features)
+            features = functional.relu(functional.max_pool2d(features, 2) if pool else features)
+        return features.flatten(1)
+
+
+def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
+    """Return what everything costs, in seconds unless the name says otherwise.
+
+    `train_step_ratio_escnn_fp32` and `train_step_ratio_plain` compare a training step with escnn's and with that of an
+    ordinary network of the same expanded widths in its faster precision, `inference_ratio_b1` and `_b5` inference with
+    the latter's. `train_step_floor_s` is what its arithmetic takes at the rate of large matrix products, in `--dtype`.
+    `plugin_import_s` is what the plugin adds to LeRobot's import, `loader_share` what loading a batch takes over what a
+    training step does.
+    """
+    from lerobot_policy_symview.nn.escnn_bridge import EscnnEncoder
+
+    start = time.perf_counter()
+    policy = _policy(config)
+    construct = time.perf_counter() - start
+    encoder = policy.network.encoder
+    assert isinstance(encoder, ImageEncoder)
+    plain = PlainNetwork(encoder).to(config.device)
+    escnn = EscnnEncoder(encoder, initialize=False).to(config.device)
+    for parameter in escnn.parameters():
+        nn.init.normal_(parameter, std=0.02)
+    networks: dict[str, tuple[nn.Module, str]] = {"": (encoder, config.dtype), "escnn_": (escnn, "float32")}
+    networks |= {f"plain_{dtype}_": (plain, dtype) for dtype in _precisions(config.device)}
+    picture, state = _input(config, policy, config.batch_size)
+    calls = {name: _training_step(network, picture, state, dtype) for name, (network, dtype) in networks.items()}
+    steps = _medians(calls, config.repeats, "step")
+    results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
+    results |= {
+        "train_step_ratio_escnn_fp32": steps[""] / steps["escnn_"],
+        "train_step_ratio_plain": steps[""] / _plain(steps),
+        "train_step_floor_s": _dense_operations(plain, config) / _operations_per_second(config),
+    }
+    del networks["escnn_"]
+    if "plain_bfloat16_" in networks:  # converted once, not at every call
+        networks["plain_bfloat16_"] = (deepcopy(plain).to(torch.bfloat16), "bfloat16")
+    for batch in (1, 5):
+        seen = _input(config, policy, batch)
+        calls = {name: _inference(network.eval(), *seen, dtype) for name, (network, dtype) in networks.items()}
+        times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
+        results |= {
+            f"inference_ms_b{batch}": 1000 * times[""],
+            f"inference_ratio_b{batch}": times[""] / _plain(times),
+        }
+    loading = _loading_seconds(config)
+    return results | {
+        "plugin_import_s": _plugin_import(),
+        "construct_s": construct,
+        "loader_s": loading,
+        "loader_share": loading / steps[""],
+    }
+
+
+def _policy(config: PolicyBenchmark) -> SymviewBcPolicy:
+    settings = SymviewBcConfig(device=config.device, width=config.width, crop_size=config.crop_size)
+    settings.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),))}
+    return SymviewBcPolicy(settings).to(config.device)
+
+
+def _input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    size = config.crop_size
+    picture = torch.rand(batch, policy.config.channels, size, size, generator=generator)
+    return picture.to(config.device), torch.rand(batch, 2, generator=generator).to(config.device)
+
+
+def _precisions(device: str) -> list[str]:
+    """Return what an ordinary network is run in; without vector instructions for it, bfloat16 takes minutes."""
+    is_emulated = device == "cpu" and not torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+    return ["float32"] if is_emulated else ["float32", "bfloat16"]
+
+
+def _plain(times: Mapping[str, float]) -> float:
+    """Return the ordinary network's time in its faster precision."""
+    return min(seconds for name, seconds in times.items() if name.startswith("plain_"))
+
+
+def _training_step(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
+    """Return a training step: least squares on the features, which any head costs next to nothing beside."""
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-5)
+
+    def step() -> None:
+        network.train()
+        with torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16"):
+            features = network(picture, state)
+        features.float().square().mean().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return step
+
+
+def _inference(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
+    def run() -> None:
+        reduced = torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
+        with torch.inference_mode(), reduced:
+            network(picture, state)
+
+    return run
+
+
+def _medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str) -> dict[str, float]:
+    """Time all calls in turn, once unmeasured and then `repeats` times: median seconds."""
+    times: dict[str, list[float]] = {key: [] for key in calls}
+    for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
+        for key, call in calls.items():
+            _finish()
+            start = time.perf_counter()
+            call()
+            _finish()
+            if repeat:
+                times[key].append(time.perf_counter() - start)
+    return {key: statistics.median(values) for key, values in times.items()}
+
+
+def _finish() -> None:
+    """Wait for a GPU, if there is one: calls return before it is done."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
+    """Floating-point operations of a dense training step: three convolutions per layer, two for the first."""
+    side, total = config.crop_size, 0.0
+    for index, (layer, pool) in enumerate(zip(network.layers, network.pooled, strict=True)):
+        assert isinstance(layer, nn.Conv2d)
+        side += 2 * int(layer.padding[0]) - 2
+        total += 2 * layer.weight.numel() * side * side * (2 if index == 0 else 3)
+        side = side // 2 if pool else side
+    return total * config.batch_size
+
+
+def _operations_per_second(config: PolicyBenchmark, size: int = 1024, repeats: int = 5) -> float:
+    """Measure matrix products, the fastest arithmetic there is."""
+    a, b = torch.rand(2, size, size, device=config.device, dtype=getattr(torch, config.dtype))
+    return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
+
+
+def _plugin_import() -> float:
+    command = [sys.executable, "-c", PLUGIN]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  our own words
+    return float(done.stdout.split()[-1])
+
+
+def _loading_seconds(config: PolicyBenchmark) -> float:
+    """Return the time a batch takes LeRobot's loader in the training process, of a dataset that holds only views."""
+    from lerobot.datasets import LeRobotDataset
+
+    with tempfile.TemporaryDirectory() as folder:
+        recorded, views = Path(folder) / "recorded", Path(folder) / "views"
+        target = NewDataset("benchmark/recorded", recorded)
+        generate(GenerateConfig(target, env=RecordedEnv(), num_episodes=LOADED_EPISODES))
+        add_views(
+            AddViewsConfig(
+                PushedDataset("benchmark/recorded", recorded),
+                new_repo_id="benchmark/views",
+                new_root=views,
+                size=config.crop_size + MARGIN,
+                keep=[],
+            )
+        )
+        dataset = LeRobotDataset("benchmark/views", root=views)
+        loader = torch.utils.data.DataLoader(
+            dataset,
+            batch_size=config.batch_size,
+            sampler=torch.utils.data.RandomSampler(dataset, num_samples=3 * config.batch_size, replacement=True),
+        )
+        times, start = [], time.perf_counter()
+        for _ in loader:
+            times.append(time.perf_counter() - start)
+            start = time.perf_counter()
+    return statistics.median(times)

@@ -1,0 +1,257 @@
+"""What views cost: as ratios to OpenCV's warp of the same image in the same run, and offline, end to end."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lerobot_symview import keys
+from lerobot_symview.datasets import derivation
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.image_codec import decode_rgb, encode_rgb
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.geometry.homography import image_from_topdown
+from lerobot_symview.views import Frame, make_view
+from symview_eval.benchmarks.clock import Clock, seconds
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import EnvSettings, NewDataset
+
+BATCH = 64  # frames on a GPU
+NOISE = 2.0  # levels of 255, standard deviation: a webcam indoors
+RECORDED = 25  # episodes that the offline dataset repeats
+VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
+    "reproject_nearest": ("reproj", {}),
+    "reproject_none": ("reproj", {"infill": "none"}),
+    "reproject_local": ("reproj", {"infill": "local"}),
+    "reproject_scale_2": ("reproj", {"source_scale": 2}),
+    "perspective": ("persp", {"gripper": False}),
+    "perspective_with_gripper": ("persp", {}),
+}
+CODECS = (
+    (SourceDataset, "decode"),
+    (derivation, "encode_rgb"),
+    (derivation, "encode_metres"),
+    (derivation, "image_column"),
+    (pq.ParquetFile, "read_row_groups"),
+    (pq.ParquetWriter, "write_table"),
+)
+
+
+@dataclass(frozen=True)
+class ViewsBenchmark:
+    """Cost of views at 152 x 152 on one core, and of `symview-add-views`."""
+
+    repeats: int = 300
+    """How often each view is made; each time is followed by one of OpenCV's warp, whose ratio counts."""
+    frames: int = 10_000
+    """Frames of the dataset to which views are added; 0 leaves that out. A second process takes seconds to start."""
+    rounds: int = 3
+    """How often views are added to all of it, by one process and by two."""
+    json: bool = False
+    """Print one JSON object instead of a table."""
+
+    def __post_init__(self) -> None:
+        for name in ("repeats", "rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.frames < 0:
+            raise ValueError(f"--frames must not be negative, got {self.frames}")
+
+
+def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
+    """Return medians, with quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
+
+    `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
+    costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
+    decoding, encoding and writing, for images with a real camera's noise; `offline_two_process_speedup` what a second
+    process gains, start-up included, of which the first round has most; `frames_per_s` what one process makes of both
+    views. These have quartiles, too.
+    """
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        results = _ratios(_frame(), config.repeats)
+    finally:
+        cv2.setNumThreads(threads)
+    results |= _on_a_gpu(config.repeats)
+    return results | (_offline(config.frames, config.rounds) if config.frames else {})
+
+
+def _on_a_gpu(repeats: int) -> dict[str, float]:
+    import torch  # not above: worker processes import this module, and torch takes longer than their work
+
+    return batched_ratios(_frame(), repeats, "cuda") if torch.cuda.is_available() else {}
+
+
+def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
+    """Return what a frame of a batch of 64 costs on `device`, and that over copying there what it reads and writes."""
+    import torch
+
+    from lerobot_symview.views.torch_backend import FrameBatch, render_batch
+
+    def synchronize() -> None:
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    assert frame.depth is not None
+    rgb = torch.from_numpy(frame.rgb.copy()).permute(2, 0, 1)[None].expand(BATCH, -1, -1, -1).contiguous()
+    depth = torch.from_numpy(frame.depth.copy())[None].expand(BATCH, -1, -1).contiguous()
+    gripper = torch.as_tensor(frame.gripper)[None].expand(BATCH, -1)
+    cameras = [frame.camera] * BATCH
+    batch = FrameBatch(rgb.to(device), depth.to(device), cameras, frame.workspace, gripper.to(device))
+    moved = torch.empty(BATCH * _moved_bytes(frame), dtype=torch.uint8, device=device)
+    target = torch.empty_like(moved)
+
+    def finished(call: Callable[[], object]) -> float:
+        def whole() -> None:
+            call()
+            synchronize()
+
+        synchronize()
+        return seconds(whole)
+
+    results = {}
+    for name in ("reproject_nearest", "reproject_none", "perspective"):
+        view_name, options = VIEWS[name]
+        view = make_view(view_name, **options)
+        render = partial(render_batch, view, batch)
+        render()
+        times = [(finished(render), finished(lambda: target.copy_(moved))) for _ in range(repeats)]
+        results[f"batched_{name}_us"] = 1e6 * statistics.median(one for one, _ in times) / BATCH
+        results[f"batched_{name}_copy_ratio"] = statistics.median(one / copy for one, copy in times)
+    return results
+
+
+def _moved_bytes(frame: Frame) -> int:
+    """Return how many bytes a reprojection must read and write."""
+    assert frame.depth is not None
+    return frame.rgb.nbytes + frame.depth.nbytes + make_view("reproj").size ** 2 * 7  # colour and float height
+
+
+def _frame() -> Frame:
+    env = EnvSettings().make()
+    observation, _ = env.reset(seed=0)
+    camera = env.cameras["side"]
+    rgb, depth = observation["pixels"]["side"], observation["images.side_depth"][0]
+    frame = Frame(rgb, depth, camera, env.workspace, observation["agent_pos"])
+    env.close()
+    return frame
+
+
+def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
+    assert frame.depth is not None
+    size = make_view("persp").size
+    homography = image_from_topdown(frame.camera, frame.workspace, size)
+
+    def warp() -> None:
+        cv2.warpPerspective(frame.rgb, homography, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+
+    moved = np.empty(_moved_bytes(frame), dtype=np.uint8)
+    target = np.empty_like(moved)
+    candidates: dict[str, Callable[[], object]] = {"floor": lambda: np.copyto(target, moved)}
+    for name, (view_name, options) in VIEWS.items():
+        view = make_view(view_name, **options)
+        candidates[name] = lambda view=view: view.render(frame)  # type: ignore[misc]
+    warps: list[float] = []
+    results: dict[str, float] = {}
+    for name, candidate in candidates.items():
+        candidate()
+        warp()
+        ratios = []
+        for _ in range(repeats):
+            reference = seconds(warp)
+            warps.append(reference)
+            ratios.append(seconds(candidate) / reference)
+        results |= _median_and_quartiles(f"{name}_ratio", ratios)
+    return {"warp_us": 1e6 * statistics.median(warps)} | results
+
+
+def _median_and_quartiles(name: str, values: list[float]) -> dict[str, float]:
+    # inclusive: no quartile lies outside of what was measured
+    low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
+    return {name: median, f"{name}_low": low, f"{name}_high": high}
+
+
+def _offline(frames: int, rounds: int) -> dict[str, float]:
+    found: dict[str, list[float]] = {"offline_codec_share": [], "offline_two_process_speedup": [], "frames_per_s": []}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recorded, source = _repeated_dataset(folder, frames)
+        total = SourceDataset(source).info["total_frames"]
+
+        def add(dataset: Path, num_workers: int = 1) -> float:
+            target = folder / "views"
+            config = AddViewsConfig(
+                PushedDataset("benchmark/source", dataset),
+                new_root=target,
+                views=["reproj", "persp"],
+                num_workers=num_workers,
+            )
+            taken = seconds(lambda: add_views(config))
+            shutil.rmtree(target)
+            return taken
+
+        add(recorded)  # imports and compiled kernels are loaded before the clocks start
+        for _ in range(rounds):
+            with _codec_clocks() as clocks:
+                alone = add(source)
+            found["offline_codec_share"].append(sum(clock.milliseconds for clock in clocks) / 1000 / alone)
+            found["offline_two_process_speedup"].append(alone / add(source, num_workers=2))
+            found["frames_per_s"].append(total / alone)
+    return {key: value for name, values in found.items() for key, value in _median_and_quartiles(name, values).items()}
+
+
+def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
+    """Return a recorded dataset with a real camera's noise, and one that repeats it to at least `frames` frames."""
+    from lerobot.datasets import aggregate_datasets
+
+    target = NewDataset("benchmark/recorded", folder / "recorded")
+    recorded = generate(GenerateConfig(target, env=RecordedEnv(oracle=False), num_episodes=RECORDED))
+    for file in sorted((recorded / "data").rglob("*.parquet")):
+        _add_noise(file, keys.rgb("side"))
+    repeats = -(-frames // SourceDataset(recorded).info["total_frames"])
+    if repeats == 1:
+        return recorded, recorded
+    aggregate_datasets(
+        [target.repo_id] * repeats,
+        "benchmark/source",
+        roots=[recorded] * repeats,
+        aggr_root=folder / "source",
+        concatenate_data=False,
+    )
+    return recorded, folder / "source"
+
+
+def _add_noise(file: Path, key: str) -> None:
+    """Make a table's colour images as hard to compress as a camera's, whose pixels are never quite alike."""
+    table, rng = pq.read_table(file), np.random.default_rng(0)
+    cells = table[key].to_pylist()
+    for cell in cells:
+        image = decode_rgb(cell["bytes"])
+        noisy = image + rng.normal(0.0, NOISE, image.shape)
+        cell["bytes"] = encode_rgb(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    column = table.schema.get_field_index(key)
+    pq.write_table(table.set_column(column, table.field(column), pa.array(cells, table.field(column).type)), file)
+
+
+@contextmanager
+def _codec_clocks() -> Iterator[list[Clock]]:
+    clocks = [Clock(owner, name) for owner, name in CODECS]
+    try:
+        yield clocks
+    finally:
+        for clock in clocks:
+            clock.remove()

@@ -1,0 +1,1 @@
+"""Reading what is known of cameras that datasets and observations do not describe themselves."""

@@ -1,0 +1,180 @@
+"""Calibration from a file, for datasets and robots that do not carry their own.
+
+Matrices are rounded to float32, as which datasets store them, so that a view has the same bits whichever it is made by.
+
+The file is YAML or JSON:
+
+    units: m                        # of the poses, m or mm; K is in pixels
+    workspace:                      # the square seen from above, metres; optional
+      center: [0.45, 0.0]
+      size: 0.4
+    cameras:
+      front:                        # as in observation.images.front
+        height: 480
+        width: 640
+        intrinsics: [[615.3, 0, 319.5], [0, 615.1, 239.5], [0, 0, 1]]
+        world_from_cam:             # OpenCV axes; the world's z axis points up and its table is z = 0
+          - [0,  0.70711, -0.70711, 1.02]
+          - [1,  0,        0,       0   ]
+          - [0, -0.70711, -0.70711, 0.57]
+          - [0,  0,        0,       1   ]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_symview.geometry.camera import Array, CalibrationError, Camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError
+
+METRES = {"m": 1.0, "mm": 0.001}
+CAMERA_ENTRIES = ("height", "width", "intrinsics", "world_from_cam")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Cameras that do not move, by name, and the workspace they look at, where that is stated."""
+
+    cameras: dict[str, Camera]
+    workspace: Workspace | None = None
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera.
+
+        Raises:
+            CalibrationError: if it is not among them.
+        """
+        if name not in self.cameras:
+            raise CalibrationError(f"the calibration has no camera {name!r}; it has {', '.join(self.cameras)}")
+        return self.cameras[name]
+
+
+def read_calibration(file: Path) -> Calibration:
+    """Read the file that is described at the top of this module.
+
+    Raises:
+        CommandError: if it cannot be read as YAML or JSON.
+        CalibrationError: all that is wrong with it, in one message.
+    """
+    import yaml
+
+    try:
+        text = file.read_text()
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
+            raise CommandError(f"--calibration={file} has an alias (*name): write out what it stands for")
+        content = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise CommandError(f"cannot read --calibration={file}: {error}") from None
+    try:
+        return parse_calibration(content)
+    except CalibrationError as error:
+        raise CalibrationError(f"--calibration={file}: {error}") from None
+
+
+def parse_calibration(content: Any) -> Calibration:
+    """Return the calibration that a parsed file states.
+
+    Raises:
+        CalibrationError: all that is wrong with it, in one message.
+    """
+    if not isinstance(content, Mapping):
+        raise CalibrationError(f"expected a mapping with units and cameras, got {type(content).__name__}")
+    problems = _strangers("the file", content, ("units", "workspace", "cameras"))
+    units = content.get("units")
+    if not isinstance(units, str) or units not in METRES:
+        problems.append(f"units must be m or mm, got {units!r}")
+    named = content.get("cameras")
+    if not isinstance(named, Mapping) or not named:
+        problems.append("cameras must name at least one camera")
+        named = {}
+    metres = METRES.get(str(units), 1.0)
+    cameras, workspace = {}, None
+    for name, entries in named.items():
+        try:
+            cameras[str(name)] = _camera(entries, metres)
+        except CalibrationError as error:
+            problems.append(f"camera {name!r}: {error}")
+    if content.get("workspace") is not None:
+        try:
+            workspace = parse_workspace(content["workspace"])
+        except CalibrationError as error:
+            problems.append(f"workspace: {error}")
+    if problems:
+        raise CalibrationError("; ".join(problems))
+    return Calibration(cameras, workspace)
+
+
+def parse_workspace(entries: Any) -> Workspace:
+    """Return the workspace that a mapping of `Workspace`'s arguments states.
+
+    Raises:
+        CalibrationError: what is wrong with it.
+    """
+    known = [field.name for field in fields(Workspace)]
+    if not isinstance(entries, Mapping) or set(entries) - set(known):
+        raise CalibrationError(f"expected a mapping with any of {', '.join(known)}, got {entries!r}")
+    try:
+        arguments: dict[str, Any] = {key: float(value) for key, value in entries.items() if key != "center"}
+        if "center" in entries:
+            x, y = map(float, entries["center"])
+            return Workspace(center=(x, y), **arguments)
+        return Workspace(**arguments)
+    except (TypeError, ValueError) as error:
+        raise CalibrationError(str(error)) from None
+
+
+def plain_calibration(calibration: Calibration) -> dict[str, Any]:
+    """Return what `parse_calibration` reads, as JSON can hold it."""
+    cameras = {
+        name: {
+            "height": camera.height,
+            "width": camera.width,
+            "intrinsics": camera.intrinsics.tolist(),
+            "world_from_cam": camera.world_from_cam.tolist(),
+        }
+        for name, camera in calibration.cameras.items()
+    }
+    content: dict[str, Any] = {"units": "m", "cameras": cameras}
+    if calibration.workspace is not None:
+        content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}
+    return content
+
+
+def _camera(entries: Any, metres: float) -> Camera:
+    if not isinstance(entries, Mapping):
+        raise CalibrationError(f"expected a mapping with {', '.join(CAMERA_ENTRIES)}, got {entries!r}")
+    missing = [entry for entry in CAMERA_ENTRIES if entry not in entries]
+    problems = _strangers("it", entries, CAMERA_ENTRIES)
+    if missing:
+        problems.append(f"lacks {', '.join(missing)}")
+    if problems:
+        raise CalibrationError("; ".join(problems))
+    for side in ("height", "width"):
+        if not isinstance(entries[side], int) or entries[side] < 1:
+            raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
+    intrinsics, world_from_cam = _matrix("intrinsics", entries, 3), _matrix("world_from_cam", entries, 4)
+    world_from_cam[:3, 3] *= metres
+    return Camera(_as_stored(intrinsics), _as_stored(world_from_cam), entries["height"], entries["width"])
+
+
+def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
+    try:
+        return np.array(entries[name], dtype=np.float64).reshape(side, side)
+    except (TypeError, ValueError):
+        raise CalibrationError(f"{name} must be {side} rows of {side} numbers, got {entries[name]!r}") from None
+
+
+def _as_stored(matrix: Array) -> Array:
+    with np.errstate(over="ignore"):  # the camera refuses what is infinite
+        return matrix.astype(np.float32).astype(np.float64)
+
+
+def _strangers(owner: str, entries: Mapping[Any, Any], known: tuple[str, ...]) -> list[str]:
+    strangers = [str(entry) for entry in entries if entry not in known]
+    return [f"{owner} has the unknown {', '.join(strangers)}; expected {', '.join(known)}"] if strangers else []

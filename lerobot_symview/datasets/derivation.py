@@ -1,0 +1,298 @@
+"""A dataset derived from another: the same episodes with views added, made in parts by any number of processes.
+
+    <target>.partial/request.json       what is made; a resumed run must ask for the same
+    <target>.partial/dataset/           the result; its tables' files are the parts, each complete or absent
+    <target>.partial/statistics/        of the new images, a part each
+
+A part is a range of neighbouring episodes. Which there are follows from the source alone, so that the result is the
+same whoever writes which part when.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import Calibration
+from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
+from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
+from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.staging import disk_errors, part_of
+from lerobot_symview.views import View
+
+PART_FRAMES = 200  # at least, where a file of the source has as many
+MADE_FROM = "symview_views.json"  # in the result's `meta`
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """What is derived from what; small enough to send to every worker."""
+
+    source: Path
+    """Folder of the dataset that is read."""
+    source_files: str
+    """Its fingerprint when the work began."""
+    folder: Path
+    """`<target>.partial`."""
+    camera: str
+    """Whose images the views are made from."""
+    views: dict[str, View]
+    """What is added."""
+    workspace: Workspace
+    """What the views show."""
+    calibration: Calibration | None
+    """The camera's, where the dataset has none; it is added too."""
+    dropped: list[str]
+    """Features of the source that are left out."""
+    added: Features
+    """Features that are new."""
+    schema: pa.Schema = field(repr=False)
+    """Of the result's tables."""
+
+    @property
+    def dataset(self) -> Path:
+        """Where the result grows."""
+        return self.folder / "dataset"
+
+    def open_source(self) -> SourceDataset:
+        """Return the dataset that is read, whose metadata a process reads once."""
+        return _opened(self.source, self.source_files)
+
+    def reader(self, source: SourceDataset) -> FrameReader:
+        """Return what puts the frames of `source` together."""
+        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration)
+
+    def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
+        """Return `rgb` or `height` for every new image feature."""
+        return {
+            keys.view(self.camera, output): kind
+            for view in self.views.values()
+            for output, kind in view.outputs.items()
+        }
+
+    def no_statistics(self) -> dict[str, ImageStatistics]:
+        """Return the statistics of no image, for every new image feature."""
+        return {key: ImageStatistics.empty(kind) for key, kind in self.image_kinds().items()}
+
+    def table_file(self, source: SourceDataset, part: int) -> Path:
+        """Where a part's table is in the result."""
+        return self.dataset / source.data_path(*self.place(source, part))
+
+    def place(self, source: SourceDataset, part: int) -> tuple[int, int]:
+        """Chunk and file of a part's table."""
+        return divmod(part, source.info["chunks_size"])
+
+    def statistics_file(self, part: int) -> Path:
+        """Where the statistics of a part's new images are."""
+        return self.folder / "statistics" / f"{part:06d}.npz"
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path, _fingerprint: str) -> SourceDataset:
+    return SourceDataset(folder)
+
+
+def cut_parts(source: SourceDataset) -> list[range]:
+    """Return the episodes of every part: neighbours in one file, of 200 frames together or a few more."""
+    parts: list[range] = []
+    frames = 0
+    for episode, row in enumerate(source.episodes):
+        if parts and frames < PART_FRAMES and source.data_place(episode) == source.data_place(parts[-1].start):
+            parts[-1] = range(parts[-1].start, episode + 1)
+            frames += row["length"]
+        else:
+            parts.append(range(episode, episode + 1))
+            frames = row["length"]
+    return parts
+
+
+def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -> pa.Schema:
+    """Return the schema of the result's tables, with the declaration that Hugging Face's `datasets` reads."""
+    from datasets import Features as TableFeatures
+    from datasets import Image, List, Value
+
+    features = dict(TableFeatures.from_arrow_schema(pq.read_schema(source.data_file(0))))
+    for key in dropped:
+        features.pop(key, None)  # a video has no column
+    for key, feature in added.items():
+        is_image = feature["dtype"] == "image"
+        features[key] = Image() if is_image else List(Value(feature["dtype"]), length=feature["shape"][0])
+    return TableFeatures(features).arrow_schema
+
+
+def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
+    """Write the table and the statistics of a part's episodes, unless they are there; return how many frames."""
+    index, episodes = part
+    source = derivation.open_source()
+    count = sum(source.episodes[episode]["length"] for episode in episodes)
+    table_file, statistics_file = derivation.table_file(source, index), derivation.statistics_file(index)
+    if table_file.exists():
+        return count
+    merged = derivation.no_statistics()
+    summaries: dict[str, list[NDArray]] = {key: [] for key in merged}
+    reader = derivation.reader(source)
+    kept = [name for name in derivation.schema.names if name not in derivation.added]
+    columns = list(dict.fromkeys([*kept, *reader.columns()]))
+    tables = EpisodeTables(source, source.data_file(episodes.start), columns)
+    # Written outside the result, so that what a killed process leaves behind is not in it.
+    table_part, statistics_part = (part_of(derivation.folder / file.name) for file in (table_file, statistics_file))
+    with disk_errors(derivation.folder):
+        try:
+            with pq.ParquetWriter(table_part, derivation.schema) as writer:
+                for episode in episodes:
+                    table = tables.read(episode)
+                    new, statistics = _render(derivation, reader, episode, table)
+                    arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
+                    # a row group per episode, as LeRobot writes them
+                    writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
+                    for key, one in statistics.items():
+                        summaries[key].append(one.summary())
+                        merged[key].merge(one)
+            with statistics_part.open("wb") as stream:
+                np.savez_compressed(stream, **_packed(merged, summaries))
+            for done, file in ((statistics_part, statistics_file), (table_part, table_file)):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                done.replace(file)
+        finally:
+            for leftover in (table_part, statistics_part):
+                leftover.unlink(missing_ok=True)
+    return count
+
+
+def _render(
+    derivation: Derivation, reader: FrameReader, episode: int, table: pa.Table
+) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
+    """Return the new columns of an episode, and the statistics of its new images."""
+    kinds, statistics = derivation.image_kinds(), derivation.no_statistics()
+    encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
+    for frame in reader.frames(episode, table):
+        for view in derivation.views.values():
+            for output, image in view.render(frame).items():
+                key = keys.view(derivation.camera, output)
+                statistics[key].add(image)
+                encoded[key].append(encode_rgb(image) if kinds[key] == "rgb" else encode_metres(image))
+    columns: dict[str, pa.Array] = {}
+    for key, images in encoded.items():
+        columns[key] = image_column(images, "png" if kinds[key] == "rgb" else "tiff")
+    for key, values in _added_vectors(derivation).items():
+        flat = pa.array(np.tile(values, len(table)))
+        columns[key] = pa.FixedSizeListArray.from_arrays(flat, len(values))
+    return columns, statistics
+
+
+def image_column(images: list[bytes], extension: str) -> pa.StructArray:
+    """Return encoded images as the column that Hugging Face's `datasets` reads, with file names like LeRobot's."""
+    names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
+    return pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
+
+
+def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
+    """Return the calibration that the result gains, by feature."""
+    if derivation.calibration is None:
+        return {}
+    camera = derivation.calibration.camera(derivation.camera)
+    matrices = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
+    return {key(derivation.camera): matrix.astype(np.float32).ravel() for key, matrix in matrices.items()}
+
+
+def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
+    packed: dict[str, Any] = {}
+    for key, one in merged.items():
+        packed |= {f"{key}/images": one.images, f"{key}/counts": one.counts, f"{key}/sums": one.sums}
+        packed[f"{key}/summaries"] = np.stack(summaries[key])
+    return packed
+
+
+def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> Path:
+    """Complete the result, whose tables are all there, by videos and metadata, and return its folder."""
+    source = derivation.open_source()
+    with disk_errors(derivation.folder):
+        for key, feature in source.features.items():
+            if feature["dtype"] == "video" and key not in derivation.dropped:
+                shutil.copytree(source.folder / "videos" / key, derivation.dataset / "videos" / key, dirs_exist_ok=True)
+        meta = derivation.dataset / "meta"
+        if meta.exists():
+            shutil.rmtree(meta)
+        shutil.copytree(source.folder / "meta", meta)
+        totals, of_episodes = _collect_statistics(derivation, source, parts)
+        for file in sorted((meta / "episodes").rglob("*.parquet")):
+            _rewrite_episodes(file, derivation, source, parts, of_episodes)
+        info = dict(source.info)
+        kept = {key: feature for key, feature in source.features.items() if key not in derivation.dropped}
+        info["features"] = kept | derivation.added
+        if not any(feature["dtype"] == "video" for feature in kept.values()):
+            info["video_path"] = None
+        (meta / "info.json").write_text(json.dumps(info, indent=4))
+        stats = json.loads((meta / "stats.json").read_text())
+        stats = {key: value for key, value in stats.items() if key not in derivation.dropped} | totals
+        (meta / "stats.json").write_text(json.dumps(stats, indent=4, sort_keys=True))
+        (meta / MADE_FROM).write_text(json.dumps(description, indent=4))
+    return derivation.dataset
+
+
+def _collect_statistics(
+    derivation: Derivation, source: SourceDataset, parts: list[range]
+) -> tuple[dict[str, Any], dict[str, dict[str, list[Any]]]]:
+    """Return the statistics of every new feature over the dataset, and lists of them over each episode."""
+    totals = derivation.no_statistics()
+    summaries: dict[str, list[NDArray]] = {key: [] for key in totals}
+    for part in range(len(parts)):
+        with np.load(derivation.statistics_file(part)) as content:
+            for key, total in totals.items():
+                images, counts, sums = (content[f"{key}/{name}"] for name in ("images", "counts", "sums"))
+                total.merge(ImageStatistics(total.kind, int(images), counts, sums))
+                summaries[key].append(content[f"{key}/summaries"])
+    lengths = [row["length"] for row in source.episodes]
+    collected = {key: image_summary(total.summary(), total.images) for key, total in totals.items()}
+    of_episodes = {key: image_summary(np.concatenate(values), lengths) for key, values in summaries.items()}
+    for key, values in _added_vectors(derivation).items():
+        collected[key] = constant_summary(values, sum(lengths))
+        each = [constant_summary(values, length) for length in lengths]
+        of_episodes[key] = {name: [one[name] for one in each] for name in each[0]}
+    return collected, of_episodes
+
+
+def _rewrite_episodes(
+    file: Path,
+    derivation: Derivation,
+    source: SourceDataset,
+    parts: list[range],
+    statistics: dict[str, dict[str, list[Any]]],
+) -> None:
+    """Say where each episode's table is now, and add and drop statistics."""
+    table = pq.read_table(file).replace_schema_metadata(None)
+    dropped = tuple(
+        f"{place}/{key}/" for place in ("stats", "videos") for key in (*derivation.dropped, *derivation.added)
+    )
+    table = table.drop_columns([name for name in table.column_names if name.startswith(dropped)])
+    episodes = table["episode_index"].to_pylist()
+    part_of_episode = {episode: part for part, range_ in enumerate(parts) for episode in range_}
+    places = np.array([derivation.place(source, part_of_episode[episode]) for episode in episodes])
+    for column, values in (("data/chunk_index", places[:, 0]), ("data/file_index", places[:, 1])):
+        table = table.set_column(table.column_names.index(column), column, pa.array(values))
+    for key, named in statistics.items():
+        for name, of_episodes in named.items():
+            column = pa.array([of_episodes[episode] for episode in episodes])
+            table = table.append_column(f"stats/{key}/{name}", column)
+    pq.write_table(table, file)
+
+
+def source_fingerprint(source: SourceDataset) -> str:
+    """Return what changes when the source's metadata or the size of any of its files does."""
+    digest = hashlib.sha256((source.folder / "meta" / "info.json").read_bytes())
+    for file in sorted(path for path in source.folder.rglob("*") if path.is_file()):
+        digest.update(f"{file.relative_to(source.folder)} {file.stat().st_size}\n".encode())
+    return digest.hexdigest()

@@ -1,0 +1,86 @@
+"""LeRobot feature declarations of what cameras and views yield."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from lerobot_symview import keys
+from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.geometry.workspace import Workspace
+
+if TYPE_CHECKING:
+    from lerobot_symview.views import View
+
+Features = dict[str, dict[str, Any]]
+IMAGE_AXES = ["height", "width", "channels"]
+
+
+def color_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
+    """Declare an RGB image; `facts` are stored with it under `info["symview"]`."""
+    return {"dtype": "image", "shape": (height, width, 3), "names": IMAGE_AXES, "info": {"symview": facts}}
+
+
+def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
+    """Declare a float32 image in metres, stored losslessly."""
+    info = {"is_depth_map": True, "depth_unit": "m", "symview": facts}
+    return {"dtype": "image", "shape": (height, width, 1), "names": IMAGE_AXES, "info": info}
+
+
+def camera_features(
+    name: str, height: int, width: int, facts: dict[str, Any], *, depth: bool = True, segmentation: bool = False
+) -> Features:
+    """Declare colour and calibration of one camera, and its depth and segmentation where it has them."""
+    features = {keys.rgb(name): color_feature(height, width, facts)}
+    if depth:
+        features[keys.depth(name)] = metric_feature(height, width, facts)
+    if segmentation:
+        labels = {"labels": {"0": "table", "1": "robot", "2 and up": "objects"}}
+        features[keys.segmentation(name)] = color_feature(height, width, facts | labels)
+    return features | calibration_features(name)
+
+
+def calibration_features(name: str) -> Features:
+    """Declare the calibration of one camera."""
+    return {
+        keys.intrinsics(name): {
+            "dtype": "float32",
+            "shape": (9,),
+            "names": [f"k{i}{j}" for i in range(3) for j in range(3)],
+        },
+        keys.world_from_cam(name): {
+            "dtype": "float32",
+            "shape": (16,),
+            "names": [f"t{i}{j}" for i in range(4) for j in range(4)],
+        },
+    }
+
+
+def view_features(
+    camera: str, name: str, view: View, workspace: Workspace, calibration: dict[str, Any] | None = None
+) -> Features:
+    """Declare the outputs of `view`, with everything needed to compute them again.
+
+    `calibration` is the content of the file that stated it; without one it is in the frames.
+    """
+    facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
+    if calibration is not None:
+        facts["calibration"] = calibration
+    declare = {"rgb": color_feature, "height": metric_feature}
+    return {
+        keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()
+    }
+
+
+def stored_workspace(features: Features) -> Workspace:
+    """Return the workspace a dataset was recorded in; the default one where it does not say."""
+    from lerobot_symview.calibration.file import parse_workspace
+
+    for key, feature in features.items():
+        facts = (feature.get("info") or {}).get("symview", {})
+        if "workspace" in facts:
+            try:
+                return parse_workspace(facts["workspace"])
+            except CalibrationError as error:
+                raise CalibrationError(f"the workspace that {key} states: {error}") from None
+    return Workspace()

@@ -1,0 +1,109 @@
+"""Datasets to the Hugging Face Hub."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HubOptions:
+    """Whether and how a dataset goes to the Hub."""
+
+    push_to_hub: bool = False
+    """Upload it to the Hugging Face Hub when it is whole; `hf auth login` first."""
+    private: bool = False
+    """Let nobody else see it there."""
+    tags: list[str] = field(default_factory=list)
+    """Further tags of its card."""
+    branch: str | None = None
+    """Branch to upload to, made if it is not there; by default `main`."""
+
+
+@dataclass(frozen=True)
+class PushedDataset(HubOptions, DatasetTarget):
+    """A dataset that goes to the Hub if asked."""
+
+
+def push_dataset(target: DatasetTarget, options: HubOptions) -> str:
+    """Upload a dataset with its card, and return its address. What is there already is not sent again.
+
+    Raises:
+        CommandError: if that fails; the dataset stays as it is.
+    """
+    from huggingface_hub import DatasetCard, HfApi
+    from huggingface_hub.errors import RevisionNotFoundError
+
+    from lerobot_symview.datasets.card import (  # simulators, which need no tables, read the options above
+        CARD,
+        write_card,
+    )
+    from lerobot_symview.datasets.metadata import FORMAT
+
+    folder, repo_id = target.folder(), target.repo_id
+    write_card(folder, repo_id, options.tags)
+    api = HfApi()
+    with hub_errors(repo_id, "--dataset.repo_id", folder):
+        DatasetCard.load(folder / CARD).validate()
+        address = api.create_repo(repo_id, repo_type="dataset", private=options.private, exist_ok=True)
+        if options.branch:
+            api.create_branch(repo_id, branch=options.branch, repo_type="dataset", exist_ok=True)
+        api.upload_folder(
+            repo_id=repo_id,
+            folder_path=folder,
+            repo_type="dataset",
+            revision=options.branch,
+            ignore_patterns=["*.part"],
+        )
+        with suppress(RevisionNotFoundError):  # LeRobot loads the revision that is tagged with the format's version
+            api.delete_tag(repo_id, tag=FORMAT, repo_type="dataset")
+        api.create_tag(repo_id, tag=FORMAT, revision=options.branch, repo_type="dataset")
+    logger.info("pushed to %s", address)
+    return str(address)
+
+
+@contextmanager
+def hub_errors(repo_id: str, flag: str, folder: Path) -> Iterator[None]:
+    """Say what went wrong with the Hub and what to do about it.
+
+    Args:
+        repo_id: what is uploaded there.
+        flag: which names it.
+        folder: from where.
+
+    Raises:
+        CommandError: in place of the Hub's errors.
+    """
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError, OfflineModeIsEnabled
+
+    kept = f"Nothing is lost: {folder} is whole; the same command with --resume=true uploads it."
+    try:
+        yield
+    except OfflineModeIsEnabled:
+        raise CommandError(f"HF_HUB_OFFLINE=1 keeps {repo_id} from the Hub: unset it. {kept}") from None
+    except LocalTokenNotFoundError:
+        raise CommandError(f"no token for the Hub: run `hf auth login`, or set HF_TOKEN. {kept}") from None
+    except HfHubHTTPError as error:
+        status = error.response.status_code
+        reasons = {
+            401: "the Hub does not know the token: run `hf auth login` again, or set HF_TOKEN",
+            403: f"the token must not write to {repo_id}: name a {flag} of yours, or use a token that may",
+        }
+        raise CommandError(f"{reasons.get(status, f'the Hub answers {status}: {error}')}. {kept}") from None
+    except (httpx.HTTPError, OSError) as error:
+        raise CommandError(f"the Hub cannot be reached ({type(error).__name__}: {error}): try again. {kept}") from None
+    except RuntimeError as error:  # in which the client wraps what ends the upload of a file
+        if not isinstance(error.__cause__, (httpx.HTTPError, OSError)):
+            raise
+        reason = f"{error} {type(error.__cause__).__name__}: {error.__cause__}"
+        raise CommandError(
+            f"the upload broke off ({reason}): try again, what arrived is not sent twice. {kept}"
+        ) from None

@@ -1,0 +1,94 @@
+"""`meta/info.json` of a LeRobot dataset, checked where it is read: it leads nowhere else and declares what can be."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from lerobot_symview.runtime.cli import CommandError
+
+FORMAT = "v3.0"  # LeRobot's
+MOST_PIXELS = 2**26  # of an image
+COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # at least
+NUMBERS = r"\{(?:chunk|file)_index(?::0[1-9]d)?\}"
+TEMPLATES = {"data_path": NUMBERS, "video_path": rf"{NUMBERS}|\{{video_key\}}"}
+
+
+def read_info(folder: Path) -> dict[str, Any]:
+    """Return what the `meta/info.json` of a dataset says.
+
+    Raises:
+        CommandError: if there is none, one of another format, or all that is wrong with it.
+    """
+    file = folder / "meta" / "info.json"
+    if not file.is_file():
+        raise CommandError(f"there is no dataset in {folder}: check --dataset.repo_id and --dataset.root")
+    try:
+        info = json.loads(file.read_text())
+    except (ValueError, RecursionError) as error:
+        raise CommandError(f"cannot read {file}: {error}") from None
+    if not isinstance(info, dict):
+        raise CommandError(f"{file} must hold an object, got {type(info).__name__}")
+    version = info.get("codebase_version")
+    if version != FORMAT:
+        raise CommandError(f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot")
+    problems = list(_problems(info))
+    if problems:
+        raise CommandError(f"{file}: {'; '.join(problems)}")
+    return info
+
+
+def _problems(info: dict[str, Any]) -> Iterator[str]:
+    for name, least in COUNTS.items():
+        if not is_count(info.get(name), least):
+            yield f"{name} must be a number of at least {least}, got {info.get(name)!r}"
+    for name, fields in TEMPLATES.items():
+        stated = info.get(name)
+        if (name == "data_path" or stated is not None) and not _stays_inside(stated, fields):
+            yield f"{name} must be a path in the dataset, such as LeRobot's own, got {str(stated)[:200]!r}"
+    features = info.get("features")
+    if not isinstance(features, dict):
+        yield f"features must be an object, got {type(features).__name__}"
+        return
+    for key, feature in features.items():
+        yield from (f"the feature {key!r} {problem}" for problem in _feature_problems(key, feature))
+
+
+def _feature_problems(key: str, feature: Any) -> Iterator[str]:
+    if not re.fullmatch(r"[^./\\\0][^/\\\0]*", key):  # names folders of videos
+        yield "has a name that can be a path"
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+        yield "must be an object with a dtype"
+        return
+    facts = feature.get("info") or {}
+    if not isinstance(facts, dict) or not isinstance(facts.get("symview", {}), dict):
+        yield "has an info that is no object"
+    shape = feature.get("shape")
+    if feature["dtype"] in ("image", "video") and (
+        not isinstance(shape, list)
+        or len(shape) != 3
+        or not all(is_count(side, 1) for side in shape)
+        or pixels(shape) > MOST_PIXELS
+    ):
+        yield f"must have a shape of three numbers and at most {MOST_PIXELS} pixels, got {shape!r}"
+
+
+def is_count(value: Any, least: int) -> bool:
+    """Whether a value is an integer of at least `least`."""
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def pixels(shape: list[int]) -> int:
+    """Return how many pixels an image of a declared shape has, whether its channels come first or last."""
+    _, *sides = sorted(shape)
+    return sides[0] * sides[1]
+
+
+def _stays_inside(template: Any, fields: str) -> bool:
+    part = rf"(?:[\w.-]|{fields})+"
+    if not isinstance(template, str) or not re.fullmatch(rf"{part}(?:/{part})*", template):
+        return False
+    return not {".", ".."} & set(template.split("/"))

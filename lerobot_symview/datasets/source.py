@@ -1,0 +1,355 @@
+"""A LeRobot dataset on disk, read episode by episode, and the frames that views are made from.
+
+Tables are read as they are: LeRobot itself, which takes seconds to import, is needed for videos alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Buffer, Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice, repeat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pyarrow.compute import struct_field
+
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import Calibration
+from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb, encoded_size
+from lerobot_symview.datasets.metadata import is_count, pixels, read_info
+from lerobot_symview.geometry.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.views import Frame, View
+
+ROW_BYTES = 2**20  # of a table at most, beside its images
+VIDEO_FRAMES = 64  # decoded at a time
+VIDEO_TOLERANCE = 1e-4  # seconds, LeRobot's own
+
+
+class SourceDataset:
+    """A LeRobot dataset in a folder.
+
+    Args:
+        folder: where it is.
+
+    Raises:
+        CommandError: if there is none, or one of another format.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.info = read_info(folder)
+
+    @property
+    def features(self) -> Features:
+        """What it holds, as `meta/info.json` says."""
+        return self.info["features"]
+
+    @cached_property
+    def episodes(self) -> list[dict[str, Any]]:
+        """What `meta/episodes` says of every episode, in order, without its statistics."""
+        files = sorted((self.folder / "meta" / "episodes").rglob("*.parquet"))
+        count = sum(pq.read_metadata(file).num_rows for file in files)
+        if count != self.info["total_episodes"]:
+            raise CommandError(
+                f"{self.folder / 'meta' / 'episodes'} has {count} rows, total_episodes is {self.info['total_episodes']}"
+            )
+        rows = []
+        for file in files:
+            names = [name for name in pq.read_schema(file).names if not name.startswith("stats/")]
+            rows += pq.read_table(file, columns=names).to_pylist()
+        rows.sort(key=lambda row: row["episode_index"] if is_count(row.get("episode_index"), 0) else -1)
+        self._check_episodes(rows)
+        return rows
+
+    def _check_episodes(self, rows: list[dict[str, Any]]) -> None:
+        """Raise a CommandError unless each row follows the one before, in whole numbers, within all frames."""
+        frames, end = self.info["total_frames"], 0
+        for index, row in enumerate(rows):
+            bounds = {
+                "episode_index": (index, index),
+                "length": (1, frames),
+                "dataset_from_index": (end, frames - 1),
+                "data/chunk_index": (0, None),
+                "data/file_index": (0, None),
+            }
+            bounds |= {name: (0, None) for name in row if name.startswith("videos/") and name.endswith("_index")}
+            for name, (least, most) in bounds.items():
+                value = row.get(name)
+                if not is_count(value, least) or (most is not None and value > most):
+                    upper = "" if most is None else f" to {most}"
+                    raise CommandError(
+                        f"{self.folder / 'meta' / 'episodes'}: episode {index} has {name} {value!r}, "
+                        f"expected a whole number from {least}{upper}"
+                    )
+            end = row["dataset_from_index"] + row["length"]
+
+    def data_file(self, episode: int) -> Path:
+        """Where an episode's table is."""
+        return self.folder / self.data_path(*self.data_place(episode))
+
+    def data_place(self, episode: int) -> tuple[int, int]:
+        """Chunk and file of an episode's table."""
+        row = self.episodes[episode]
+        return row["data/chunk_index"], row["data/file_index"]
+
+    def data_path(self, chunk: int, file: int) -> str:
+        """Path of a table, relative to the dataset."""
+        return self.info["data_path"].format(chunk_index=chunk, file_index=file)
+
+    def first_row(self, episode: int) -> int:
+        """Where an episode begins in its table's file."""
+        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_place(episode)]
+
+    @cached_property
+    def _file_starts(self) -> dict[tuple[int, int], int]:
+        starts: dict[tuple[int, int], int] = {}
+        for episode, row in enumerate(self.episodes):
+            starts.setdefault(self.data_place(episode), row["dataset_from_index"])
+        return starts
+
+    def video_file(self, key: str, episode: int) -> Path:
+        """Where an episode's images of a video feature are.
+
+        Raises:
+            CommandError: if the dataset does not say.
+        """
+        row, template = self.episodes[episode], self.info["video_path"]
+        places = {part: row.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
+        if template is None or None in places.values():
+            raise CommandError(f"{self.folder / 'meta'} does not say in which video episode {episode} of {key} is")
+        return self.folder / template.format(video_key=key, **places)
+
+    def check_files(self, features: Collection[str]) -> None:
+        """Raise a CommandError that names the files which `features` of every episode need and which are not there."""
+        videos = [key for key in features if self.features[key]["dtype"] == "video"]
+        files = {self.folder / "meta" / "stats.json": None}
+        files |= {self.folder / self.data_path(*place): None for place in self._file_starts}
+        for episode in range(len(self.episodes)):
+            files |= dict.fromkeys(self.video_file(key, episode) for key in videos)
+        missing = [str(file.relative_to(self.folder)) for file in files if not file.is_file()]
+        if missing:
+            more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+            raise CommandError(
+                f"the dataset in {self.folder} lacks {', '.join(missing[:3])}{more}: download or copy it again"
+            )
+
+    def images(self, key: str, episode: int, table: pa.Table) -> Iterator[NDArray]:
+        """Decode an image or video feature: (H, W, 3) uint8, or (H, W) distances, float metres or integer millimetres.
+
+        Args:
+            key: the feature.
+            episode: which episode.
+            table: rows of it; the images are those of these rows.
+        """
+        feature = self.features[key]
+        if feature["dtype"] == "video":
+            yield from self._video_frames(key, episode, table["timestamp"].to_numpy())
+            return
+        encoded, paths = (struct_field(table[key], part) for part in ("bytes", "path"))
+        for index, image in enumerate(encoded):
+            data = image.as_buffer()
+            if data is None:
+                raise ValueError(f"{key}: expected an image in the table, got none, and the path {paths[index]}")
+            yield self.decode(key, data)
+
+    def decode(self, key: str, data: Buffer) -> NDArray:
+        """Decode one image of an image feature, as `images` yields it."""
+        feature = self.features[key]
+        self._check_size(key, *encoded_size(data))
+        if not is_depth_feature(feature):
+            return decode_rgb(data)
+        depth = decode_depth(data)
+        in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
+        return depth / np.float32(MILLIMETRES_PER_METRE) if in_millimetres and depth.dtype.kind == "f" else depth
+
+    def _check_size(self, key: str, height: int, width: int) -> None:
+        shape = self.features[key]["shape"]
+        if height * width > pixels(shape):
+            declared = " x ".join(map(str, shape))
+            raise ValueError(f"{key}: an image of {height} x {width} pixels, the dataset declares {declared}")
+
+    def _video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
+        import av
+        from lerobot.configs.video import DepthEncoderConfig
+        from lerobot.datasets.depth_utils import dequantize_depth
+        from lerobot.datasets.video_utils import decode_video_frames
+
+        row, info = self.episodes[episode], self.features[key].get("info") or {}
+        file = self.video_file(key, episode)
+        with av.open(str(file)) as container:
+            stream = container.streams.video[0]
+            self._check_size(key, stream.height, stream.width)
+            rate = float(stream.average_rate)
+        is_depth = is_depth_feature(self.features[key])
+        for first in range(0, len(timestamps), VIDEO_FRAMES):
+            moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
+            between = (max(moments) - min(moments)) * rate
+            if not between < 2 * VIDEO_FRAMES:
+                raise CommandError(f"{file}: {len(moments)} frames of {key} lie {between:.0f} frames of video apart")
+            images = decode_video_frames(file, moments, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
+            if is_depth:
+                coding = DepthEncoderConfig.from_video_info(info)
+                images = dequantize_depth(
+                    images, coding.depth_min, coding.depth_max, coding.shift, coding.use_log, output_unit="m"
+                )
+                yield from images[:, 0].numpy().astype(np.float32)
+            else:
+                yield from images.permute(0, 2, 3, 1).contiguous().numpy()
+
+
+class EpisodeTables:
+    """Reads the rows of single episodes from one of a dataset's files, however its row groups are cut.
+
+    Args:
+        dataset: the dataset.
+        file: one of its tables' files.
+        columns: which columns; by default all.
+    """
+
+    def __init__(self, dataset: SourceDataset, file: Path, columns: list[str] | None = None):
+        self._dataset = dataset
+        self._columns = columns
+        self._file = pq.ParquetFile(file)
+        metadata = self._file.metadata
+        groups = [metadata.row_group(group) for group in range(metadata.num_row_groups)]
+        images = [feature["shape"] for feature in dataset.features.values() if feature["dtype"] == "image"]
+        row_bytes = ROW_BYTES + sum(8 * pixels(shape) for shape in images)
+        largest = max((group.total_byte_size / max(group.num_rows, 1) for group in groups), default=0)
+        if largest > row_bytes:
+            raise CommandError(f"{file} has rows of {largest:.0f} bytes, more than the {row_bytes} its images need")
+        counts = [group.num_rows for group in groups]
+        self._starts = np.cumsum([0, *counts])
+
+    def read(self, episode: int) -> pa.Table:
+        """Return an episode's rows."""
+        first = self._dataset.first_row(episode)
+        count = self._dataset.episodes[episode]["length"]
+        if not 0 <= first <= self._starts[-1] - count:
+            raise CommandError(
+                f"episode {episode} has rows {first} to {first + count} by length and dataset_from_index, "
+                f"its table has {self._starts[-1]}"
+            )
+        begin = int(np.searchsorted(self._starts, first, side="right")) - 1
+        end = int(np.searchsorted(self._starts, first + count, side="left"))
+        table = self._file.read_row_groups(list(range(begin, end)), columns=self._columns, use_threads=False)
+        return table.slice(first - int(self._starts[begin]), count)
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Puts together the frames of one camera.
+
+    Args:
+        dataset: where they are.
+        camera: which camera.
+        workspace: what its views are to show.
+        views: what the frames are for, which decides what they hold.
+        calibration: the camera's, where the dataset has none of its own.
+    """
+
+    dataset: SourceDataset
+    camera: str
+    workspace: Workspace
+    views: Collection[View]
+    calibration: Calibration | None = None
+
+    @property
+    def depth(self) -> bool:
+        """Whether depth is wanted."""
+        return any(view.needs_depth for view in self.views)
+
+    @property
+    def gripper(self) -> bool:
+        """Whether the gripper's state is wanted."""
+        return any(view.needs_gripper for view in self.views)
+
+    def features(self) -> list[str]:
+        """Return the features that `frames` reads, whether the dataset has them or not."""
+        wanted = [keys.rgb(self.camera), "timestamp"]
+        wanted += [keys.depth(self.camera)] if self.depth else []
+        wanted += [keys.STATE] if self.gripper else []
+        if self.calibration is None:
+            wanted += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        return wanted
+
+    def columns(self) -> list[str]:
+        """Return the columns of the tables that `frames` reads; what is video is not among them."""
+        features = self.dataset.features
+        return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
+
+    def check(self) -> None:
+        """Raise a ValueError that names what is wanted and not in the dataset, and what can be done."""
+        features = self.dataset.features
+        missing = [key for key in self.columns() if key not in features]
+        depth = keys.depth(self.camera)
+        if self.depth and depth in features and not is_depth_feature(features[depth]):
+            missing.append(f"{depth} as a depth feature")
+        if self.gripper and keys.STATE in features and gripper_entries(features) is None:
+            missing.append(f"{', '.join(keys.STATE_NAMES)} among the names of {keys.STATE}")
+        if not missing:
+            return
+        cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
+        remedy = f"--camera={self.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
+        if any(keys.STATE in one for one in missing):
+            remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
+        raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
+
+    def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
+        """Yield the frames of an episode, whose rows `table` holds.
+
+        Raises:
+            CalibrationError: if a frame's calibration is none.
+        """
+        colors = self.dataset.images(keys.rgb(self.camera), episode, table)
+        depths = self.dataset.images(keys.depth(self.camera), episode, table) if self.depth else repeat(None)
+        states: Iterator[Any] = repeat(None)
+        if self.gripper:
+            states = iter(vectors(table, keys.STATE)[:, gripper_entries(self.dataset.features)])
+        matrices: Iterator[Any] = repeat(None)
+        if self.calibration is None:
+            stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
+            matrices = zip(*stored, strict=True)
+        moments = zip(colors, depths, states, matrices, strict=False)
+        for index, (rgb, depth, state, stated) in enumerate(islice(moments, len(table))):
+            try:
+                camera = self._camera(stated, *rgb.shape[:2])
+            except CalibrationError as error:
+                raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
+            yield Frame(rgb, depth, camera, self.workspace, state)
+
+    def _camera(self, matrices: tuple[NDArray, NDArray] | None, height: int, width: int) -> Camera:
+        if matrices is not None:
+            return stored_camera(*matrices, height, width)
+        assert self.calibration is not None
+        camera = self.calibration.camera(self.camera)
+        if (camera.height, camera.width) != (height, width):
+            raise CalibrationError(
+                f"the calibration is for {camera.height} x {camera.width} pixels, the images have {height} x {width}"
+            )
+        return camera
+
+
+def is_depth_feature(feature: dict[str, Any]) -> bool:
+    """Whether a feature holds distances rather than colour."""
+    return bool((feature.get("info") or {}).get("is_depth_map"))
+
+
+def gripper_entries(features: Features) -> list[int] | None:
+    """Return which entries of the state are the gripper's x, y, z, yaw and aperture; None if they are not there."""
+    names = features.get(keys.STATE, {}).get("names")
+    if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
+        return None
+    return [names.index(name) for name in keys.STATE_NAMES]
+
+
+def vectors(table: pa.Table, column: str) -> NDArray:
+    """Return a column of equally long lists as an array (rows, length)."""
+    return table[column].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(table), -1)

@@ -1,0 +1,1 @@
+"""Cameras, workspaces and the geometry of views: pure functions on NumPy arrays."""

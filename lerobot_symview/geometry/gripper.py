@@ -1,0 +1,100 @@
+"""The gripper as seen from above: two finger squares whose value is the gripper's height (paper Figure 11)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import array_api_compat
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lerobot_symview.geometry.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class GripperShape:
+    """How a parallel gripper is drawn.
+
+    Args:
+        opening: distance between the fingers' inner faces at aperture 1, metres.
+        finger: side of the square that stands for a finger, metres.
+    """
+
+    opening: float = 0.08
+    finger: float = 0.024
+
+
+def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperShape | None = None) -> Any:
+    """Draw the gripper of each state into a top-down image.
+
+    Args:
+        state: (..., 5) float numpy array or torch tensor: x, y (metres, relative to the workspace centre), z (metres),
+            yaw (radians; at 0 the fingers open along x), aperture in [0, 1].
+        workspace: what the image covers.
+        pixels: side of the image.
+        shape: the gripper's dimensions.
+
+    Returns:
+        (..., pixels, pixels), same kind and dtype as `state`: z / workspace.height_limit inside a finger, 0 outside. A
+        finger's border pixels are covered in part, so the picture moves smoothly with the gripper; it turns and
+        mirrors exactly with the state, by any angle.
+    """
+    shape = shape or GripperShape()
+    xp = array_api_compat.array_namespace(state)
+    device = array_api_compat.device(state)
+    centers = ((xp.arange(pixels, dtype=state.dtype, device=device) + 0.5) / pixels - 0.5) * workspace.size
+    x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
+    forward = centers[:, None] - x
+    sideward = centers[None, :] - y
+    along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # a finger stands on either side: |.| draws both
+    across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
+    resolution = workspace.size / pixels
+    finger_center = (aperture * shape.opening + shape.finger) / 2
+    coverage = _ramp(xp, xp.abs(along - finger_center), shape, resolution) * _ramp(xp, across, shape, resolution)
+    return coverage * z / workspace.height_limit
+
+
+def gripper_picture(
+    state: NDArray[np.floating], workspace: Workspace, pixels: int, shape: GripperShape | None = None
+) -> NDArray[np.uint8]:
+    """Draw the gripper of one state (5,) as `gripper_image` does, in grey levels: (pixels, pixels) uint8, 255 = 1.
+
+    Only the square that the gripper can fill is computed.
+    """
+    shape = shape or GripperShape()
+    x, y, z, yaw, aperture = np.asarray(state, dtype=np.float64).tolist()
+    resolution = workspace.size / pixels
+    reach = math.hypot(max(aperture, 0.0) * shape.opening / 2 + shape.finger, shape.finger / 2) + resolution
+    spans = []
+    for center in (x, y):
+        first, last = (center - reach) / resolution + pixels / 2, (center + reach) / resolution + pixels / 2
+        spans.append((max(math.floor(first), 0), min(math.ceil(last), pixels)))
+    picture = np.zeros((pixels, pixels), dtype=np.uint8)
+    finger_center = (aperture * shape.opening + shape.finger) / 2
+    place = (x, y, math.cos(yaw), math.sin(yaw), finger_center, shape.finger / 2)
+    _paint(picture, spans[0], spans[1], workspace.size, place, z / workspace.height_limit)
+    return picture
+
+
+@njit(cache=True, nogil=True)
+def _paint(picture, rows, columns, size, place, brightness):  # type: ignore[no-untyped-def]
+    """Draw as `gripper_image` does, pixel by pixel."""
+    pixels = picture.shape[0]
+    resolution = size / pixels
+    x, y, cos, sin, finger_center, half = place
+    for i in range(rows[0], rows[1]):
+        forward = ((i + 0.5) / pixels - 0.5) * size - x
+        for j in range(columns[0], columns[1]):
+            sideward = ((j + 0.5) / pixels - 0.5) * size - y
+            along = abs(forward * cos + sideward * sin)
+            across = abs(sideward * cos - forward * sin)
+            inside = min(max((half - abs(along - finger_center)) / resolution + 0.5, 0.0), 1.0)
+            beside = min(max((half - across) / resolution + 0.5, 0.0), 1.0)
+            picture[i, j] = np.rint(255 * min(max(inside * beside * brightness, 0.0), 1.0))
+
+
+def _ramp(xp: Any, distance: Any, shape: GripperShape, resolution: float) -> Any:
+    return xp.clip((shape.finger / 2 - distance) / resolution + 0.5, 0.0, 1.0)

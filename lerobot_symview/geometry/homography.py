@@ -1,0 +1,93 @@
+"""RGB perspective: a plane parallel to the table warped into an image from above (paper section 4.2)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_symview.geometry.camera import Array, CalibrationError, Camera
+from lerobot_symview.geometry.workspace import Workspace
+
+FARTHEST = 30_000.0  # pixels
+
+
+class WarpMap(NamedTuple):
+    """What `cv2.remap` reads: see `warp_map`."""
+
+    whole: NDArray[np.int16]
+    fraction: NDArray[np.uint16]
+
+
+def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> Array:
+    """Return the homography (3, 3) from top-down pixels (column, row, 1) to camera pixels (u, v, 1), up to scale.
+
+    The plane lies `plane_height` metres above the table. y = K(Rx + t) restricted to that plane is itself a
+    homography, so nothing is solved for: the four workspace corners go to the four image corners by construction.
+
+    Raises:
+        CalibrationError: if a corner of the plane lies behind the camera, or the camera lies in the plane.
+    """
+    cam_from_world = camera.cam_from_world
+    if (cam_from_world[2, :3] @ workspace.corners(plane_height).T + cam_from_world[2, 3] <= 0).any():
+        raise CalibrationError(f"the workspace at height {plane_height:g} m lies partly behind the camera")
+    if abs(camera.position[2] - plane_height) < 1e-6:
+        raise CalibrationError(f"the camera lies in the plane at height {plane_height:g} m and sees it edge-on")
+    resolution = workspace.size / pixels
+    world_from_topdown = np.array(
+        [
+            [0, resolution, workspace.center[0] + (0.5 / pixels - 0.5) * workspace.size],
+            [resolution, 0, workspace.center[1] + (0.5 / pixels - 0.5) * workspace.size],
+            [0, 0, plane_height],
+            [0, 0, 1],
+        ]
+    )
+    return camera.intrinsics @ cam_from_world[:3] @ world_from_topdown
+
+
+@lru_cache(maxsize=64)
+def warp_map(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> WarpMap:
+    """Return where in the camera's image each pixel of the top-down image lies, for `warp_plane`.
+
+    It is kept for cameras and planes seen before, since finding it takes longer than using it.
+
+    Returns:
+        (pixels, pixels, 2) int16, whole camera pixels (u, v), and (pixels, pixels) uint16, the fractions in steps of
+        1/32 pixel: OpenCV's fixed-point form.
+
+    Raises:
+        CalibrationError: as `image_from_topdown`.
+    """
+    homography = image_from_topdown(camera, workspace, pixels, plane_height)
+    columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
+    u, v, w = homography @ np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
+    # Beyond the image lies black, however far; int16 holds no more.
+    image_xy = np.clip(np.stack([u, v], axis=-1) / w[:, None], -FARTHEST, FARTHEST).astype(np.float32)
+    whole, fraction = cv2.convertMaps(image_xy.reshape(pixels, pixels, 2), None, cv2.CV_16SC2)
+    return WarpMap(whole, fraction)
+
+
+def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: WarpMap) -> NDArray[np.uint8]:
+    """Warp a plane to lie flat (paper section 4.2).
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        image_from_topdown: what `warp_map` returned for its camera.
+
+    Returns:
+        (pixels, pixels, 3) uint8, bilinear, black where the plane lies outside the image.
+    """
+    return np.asarray(cv2.remap(rgb, *image_from_topdown, cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def camera_direction(camera: Camera, workspace: Workspace) -> Array:
+    """Return the horizontal unit vector (2,) from the workspace centre to the camera; zero straight above it.
+
+    It transforms as irrep(1, 1) and tells an equivariant network from where it is looking (paper section 4.2).
+    """
+    offset = camera.position[:2] - np.asarray(workspace.center)
+    length = np.linalg.norm(offset)
+    return offset / length if length > 1e-9 else np.zeros(2)

@@ -1,0 +1,79 @@
+"""The square on the table that a top-down image shows, and the pixel grid laid over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_symview.geometry.camera import Array, CalibrationError, Camera, project
+
+MINIMUM_VISIBLE = 0.6  # share of the working volume
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A square, axis-aligned working area on the table z = 0.
+
+    Raises:
+        ValueError: if a number is not finite, or a length not positive.
+    """
+
+    center: tuple[float, float] = (0.45, 0.0)
+    """x and y of its centre in the world, metres."""
+    size: float = 0.4
+    """Side T of the square, metres."""
+    height_limit: float = 0.25
+    """Height of the working volume above the table, metres."""
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([*self.center, self.size, self.height_limit]).all():
+            raise ValueError(f"a workspace must be finite, got {self}")
+        if self.size <= 0 or self.height_limit <= 0:
+            raise ValueError(
+                f"workspace size and height_limit must be positive metres, got {self.size:g} and {self.height_limit:g}"
+            )
+
+    def pixel_from_xy(self, xy: Array, pixels: int) -> Array:
+        """Map world x, y (..., 2) to continuous (row, column) (..., 2) of a pixels x pixels top-down image.
+
+        Paper Eq. 5-6, with integer coordinates at pixel centres: rows grow with x, columns with y.
+        """
+        return pixels * ((xy - np.asarray(self.center)) / self.size + 0.5) - 0.5
+
+    def xy_from_pixel(self, pixel: Array, pixels: int) -> Array:
+        """Map (row, column) (..., 2) to world x, y (..., 2); inverse of `pixel_from_xy`."""
+        return np.asarray(self.center) + ((np.asarray(pixel) + 0.5) / pixels - 0.5) * self.size
+
+    def corners(self, height: float = 0.0) -> Array:
+        """(4, 3) world points: the corners at `height` metres, in the order of image corners TL, TR, BR, BL."""
+        half = self.size / 2
+        offsets = np.array([[-half, -half], [-half, half], [half, half], [half, -half]])
+        return np.column_stack([offsets + self.center, np.full(4, float(height))])
+
+    def visible_fraction(self, camera: Camera, samples: int = 9) -> float:
+        """Fraction of the working volume (a samples^3 lattice, borders included) that lies in the camera's image."""
+        half = self.size / 2
+        axes = (
+            np.linspace(self.center[0] - half, self.center[0] + half, samples),
+            np.linspace(self.center[1] - half, self.center[1] + half, samples),
+            np.linspace(0.0, self.height_limit, samples),
+        )
+        pixels, depth = project(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), camera)
+        inside = (pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])
+        return float((inside.all(axis=-1) & (depth > 0)).mean())
+
+
+def check_visible(
+    name: str, camera: Camera, workspace: Workspace, remedy: str, minimum: float = MINIMUM_VISIBLE
+) -> None:
+    """Refuse a camera that sees too little.
+
+    Raises:
+        CalibrationError: if less than `minimum` of the working volume is in its image; says how much, and the `remedy`.
+    """
+    visible = workspace.visible_fraction(camera)
+    if visible < minimum:
+        raise CalibrationError(
+            f"camera {name!r} sees {visible:.0%} of the workspace, expected at least {minimum:.0%}: {remedy}"
+        )

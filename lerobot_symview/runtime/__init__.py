@@ -1,0 +1,1 @@
+"""Command lines, worker processes and partial results: what every console command shares."""

@@ -1,0 +1,220 @@
+"""Views of many frames at once as torch tensors, on whatever device these are, with the bits they have one by one.
+
+Every step is a separate operation in float64 or in integers, so that no device may fuse two and round differently. This
+is for GPUs: on a CPU the compiled kernels of `views` are faster.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.gripper import gripper_image
+from lerobot_symview.geometry.homography import warp_map
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.geometry.zbuffer import EMPTY, grid_from_pixel
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, check_gripper
+
+SOURCE_BITS = 31  # of a key: enough for any image's pixels, and with 32 for the height it fits a signed integer
+FRACTION = 32  # OpenCV's fixed-point steps per pixel
+INFILL_BYTES = 2**28  # of the largest intermediate
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBatch:
+    """Frames of equal size, on one device.
+
+    Args:
+        rgb: (B, 3, H, W) uint8.
+        depth: (B, H, W) float32 metres, invalid as in `Frame`; None without a sensor.
+        cameras: B calibrations.
+        workspace: what the views show.
+        gripper: (B, 5) float32, as in `Frame`; None where it is not known.
+
+    Raises:
+        ValueError: if there is not one camera for each frame, or an image's size is not its camera's, or its type
+            another.
+    """
+
+    rgb: Tensor
+    depth: Tensor | None
+    cameras: list[Camera]
+    workspace: Workspace
+    gripper: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        count, rows, columns = len(self.rgb), *self.rgb.shape[-2:]
+        if self.rgb.shape != (count, 3, rows, columns) or self.rgb.dtype != torch.uint8:
+            raise ValueError(f"rgb must be (B, 3, H, W) uint8, got {tuple(self.rgb.shape)} {self.rgb.dtype}")
+        if len(self.cameras) != count:
+            raise ValueError(f"{count} frames need as many cameras, got {len(self.cameras)}")
+        sizes = {(camera.height, camera.width) for camera in self.cameras}
+        if sizes - {(rows, columns)}:
+            raise ValueError(f"rgb has {rows} x {columns} pixels, the cameras have {sorted(sizes)}")
+        if self.depth is not None and (
+            self.depth.shape != (count, rows, columns) or not self.depth.is_floating_point()
+        ):
+            raise ValueError(
+                f"depth must be {(count, rows, columns)} float metres as rgb, "
+                f"got {tuple(self.depth.shape)} {self.depth.dtype}"
+            )
+
+
+def can_batch(view: View) -> bool:
+    """Whether `render_batch` makes this view: all but local infill, larger sources and views of others."""
+    if isinstance(view, ReprojectedView):
+        return view.infill != "local" and view.source_scale == 1
+    return isinstance(view, PerspectiveView)
+
+
+def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
+    """Return every output of `view`: (B, 3, size, size) uint8 colour or (B, size, size) float32 metres.
+
+    Raises:
+        ValueError: if `can_batch` says no, the frames lack depth or gripper that the view needs, or the gripper's state
+            is not finite.
+    """
+    if not can_batch(view):
+        raise ValueError(f"{view} is made frame by frame only")
+    if view.needs_depth and batch.depth is None:
+        raise ValueError("the view needs depth")
+    if view.needs_gripper and batch.gripper is None:
+        raise ValueError("the view needs the gripper's state")
+    if isinstance(view, ReprojectedView):
+        images = _reproject(view, batch)
+    else:
+        assert isinstance(view, PerspectiveView)
+        images = _warp(view, batch)
+    return {output: images[output] for output in view.outputs}
+
+
+def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
+    assert batch.depth is not None
+    height, source = zbuffer_batch(
+        batch.depth, batch.cameras, batch.workspace, view.size, [view.ceiling(z) for z in _gripper_heights(batch)]
+    )
+    seen = source != EMPTY
+    if view.infill == "nearest":
+        nearest = nearest_known_batch(seen).flatten(1)
+        height = height.flatten(1).gather(1, nearest).view_as(height)
+        source = source.flatten(1).gather(1, nearest).view_as(source)
+    known = (source != EMPTY)[:, None]
+    pixels = source.clamp(min=0).flatten(1)[:, None].expand(-1, 3, -1)
+    colors = batch.rgb.flatten(2).gather(2, pixels).view(len(source), 3, view.size, view.size)
+    return {
+        "reproj": torch.where(known, colors, colors.new_zeros(())),
+        "reproj_height": height,
+        "reproj_seen": (seen.to(torch.uint8) * 255)[:, None].expand(-1, 3, -1, -1),
+    }
+
+
+def zbuffer_batch(
+    depth: Tensor, cameras: list[Camera], workspace: Workspace, pixels: int, ceilings: list[float]
+) -> tuple[Tensor, Tensor]:
+    """Draw depth images from above as `zbuffer_from_depth` does, each into a buffer of its own.
+
+    Args:
+        depth: (B, H, W) float32, metres.
+        cameras: B calibrations.
+        workspace: what the buffers cover.
+        pixels: P, their side.
+        ceilings: B heights, metres, above which points are left out.
+
+    Returns:
+        heights (B, P, P) float32 and sources (B, P, P) int64.
+    """
+    count, rows, columns = depth.shape
+    matrices = [grid_from_pixel(camera, workspace, pixels) for camera in cameras]
+    rays, origin, ceiling = (
+        torch.from_numpy(np.array(values)).to(depth.device)
+        for values in ([ray for ray, _ in matrices], [start for _, start in matrices], ceilings)
+    )
+    v = torch.arange(rows, dtype=torch.float64, device=depth.device)[:, None]
+    u = torch.arange(columns, dtype=torch.float64, device=depth.device)
+    distance = depth.double()
+    rays, origin = rays[..., None, None], origin[..., None, None]  # (B, 3, 3, 1, 1) and (B, 3, 1, 1)
+    row, column, z = (
+        origin[:, axis] + distance * (rays[:, axis, 0] * u + (rays[:, axis, 1] * v + rays[:, axis, 2]))
+        for axis in range(3)
+    )
+    valid = (distance > 0) & (distance < torch.inf) & (z <= ceiling[:, None, None])
+    valid &= (row >= 0) & (column >= 0) & (row < pixels) & (column < pixels)
+    cell = torch.where(valid, row, 0.0).long() * pixels + torch.where(valid, column, 0.0).long()
+    heights = torch.where(valid, z, 0.0).float()
+    # One integer orders by height, then by earliest source: the greatest of a cell is its answer, whoever writes first.
+    index = torch.arange(rows * columns, device=depth.device).view(rows, columns)
+    key = (_ordered(heights) << SOURCE_BITS) | (2**SOURCE_BITS - 1 - index)
+    best = torch.zeros(count, pixels * pixels + 1, dtype=torch.int64, device=depth.device)
+    target = torch.where(valid, cell, pixels * pixels).flatten(1)  # the last cell takes what is left out
+    best = best.scatter_reduce(1, target, key.flatten(1), "amax")[:, :-1].view(count, pixels, pixels)
+    source = torch.where(best > 0, 2**SOURCE_BITS - 1 - (best & (2**SOURCE_BITS - 1)), EMPTY)
+    height = heights.flatten(1).gather(1, source.clamp(min=0).flatten(1)).view_as(source)
+    return torch.where(source == EMPTY, torch.zeros_like(height), height), source
+
+
+def _ordered(values: Tensor) -> Tensor:
+    """Map float32 to integers in (0, 2^32) that compare the same way."""
+    bits = (values + 0.0).view(torch.int32).long() & 0xFFFFFFFF  # adding 0 turns -0 into +0
+    return torch.where(bits >> 31 == 1, 0xFFFFFFFF - bits, bits | (1 << 31))
+
+
+def nearest_known_batch(known: Tensor) -> Tensor:
+    """Find nearest known pixels as `nearest_known` does: (B, H, W) bool to (B, H, W) int64; 0 if none is known."""
+    count, rows, columns = known.shape
+    nowhere = 4 * (rows + columns)
+    r = torch.arange(rows, device=known.device)[:, None]
+    above = torch.where(known, r, -nowhere).cummax(1).values
+    below = torch.where(known, r, nowhere + rows).flip(1).cummin(1).values.flip(1)
+    row_of = torch.where(r - above <= below - r, above, below)
+    step = (row_of - r) ** 2
+    c = torch.arange(columns, device=known.device)
+    across = (c[:, None] - c) ** 2
+    best_column = torch.empty_like(row_of)
+    chunk = max(1, INFILL_BYTES // (8 * count * columns * columns))
+    for first in range(0, rows, chunk):
+        # [b, r, c, j] is the distance from (r, c) to column j's nearest, and after it j, which decides between equals
+        distance = (step[:, first : first + chunk, None, :] + across) * columns + c
+        best_column[:, first : first + chunk] = distance.amin(-1) % columns
+    best_row = row_of.gather(2, best_column)
+    return torch.where(known.flatten(1).any(1)[:, None, None], best_row * columns + best_column, 0)
+
+
+def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
+    heights = [view.plane(z) for z in _gripper_heights(batch)]
+    maps = [
+        warp_map(camera, batch.workspace, view.size, height)
+        for camera, height in zip(batch.cameras, heights, strict=True)
+    ]
+    device = batch.rgb.device
+    whole = torch.from_numpy(np.stack([one.whole for one in maps])).to(device).long()
+    fraction = torch.from_numpy(np.stack([one.fraction for one in maps]).astype(np.int64)).to(device)
+    right, down = fraction % FRACTION, fraction // FRACTION
+    rows, columns = batch.rgb.shape[2:]
+    total = torch.zeros(len(maps), 3, view.size, view.size, dtype=torch.int64, device=device)
+    for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        x, y = whole[..., 0] + dx, whole[..., 1] + dy
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        index = torch.where(inside, y * columns + x, 0).flatten(1)[:, None].expand(-1, 3, -1)
+        color = batch.rgb.flatten(2).gather(2, index).view_as(total).long()
+        weight = (right if dx else FRACTION - right) * (down if dy else FRACTION - down)
+        total += torch.where(inside, weight, 0)[:, None] * color
+    images = {"persp": ((total + FRACTION**2 // 2) // FRACTION**2).to(torch.uint8)}
+    if view.gripper:
+        assert batch.gripper is not None
+        drawn = gripper_image(batch.gripper.double(), batch.workspace, view.size)
+        grey = torch.round(255 * drawn.clamp(0.0, 1.0)).to(torch.uint8)
+        images["persp_gripper"] = grey[:, None].expand(-1, 3, -1, -1)
+    return images
+
+
+def _gripper_heights(batch: FrameBatch) -> list[float | None]:
+    if batch.gripper is None:
+        return [None] * len(batch.rgb)
+    states = batch.gripper.tolist()
+    for state in states:  # here, where a GPU is waited for anyway
+        check_gripper(state)
+    return [z for _, _, z, *_ in states]

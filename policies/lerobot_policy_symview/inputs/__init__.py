@@ -1,0 +1,1 @@
+"""From a preprocessed observation to a network's input."""

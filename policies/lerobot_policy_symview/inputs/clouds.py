@@ -1,0 +1,81 @@
+"""Coloured points in the workspace from batches of RGBD images, on the device where these are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_symview.geometry.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of B scenes, P for each pixel of its image.
+
+    Args:
+        position: (B, P, 3) float64 metres; x and y relative to the workspace centre, z above the table.
+        color: (B, P, 3) in [0, 1].
+        valid: (B, P) bool, whether a point was measured and lies in the working volume.
+    """
+
+    position: Tensor
+    color: Tensor
+    valid: Tensor
+
+    def moved(self, motion: Motion) -> Cloud:
+        """Return the cloud of the scene moved about the workspace centre, one motion per scene."""
+        x, y = motion.move(self.position[..., 0], self.position[..., 1])
+        return replace(self, position=torch.stack([x, y, self.position[..., 2]], dim=-1))
+
+    def sample(self, count: int, shuffle: bool) -> Tensor:
+        """Choose `count` valid points per scene: (B, count, 6) float32 of x, y, z and colour.
+
+        Without `shuffle` the choice is the same for every image of one size. A scene of fewer points repeats them, one
+        of none has them all at its centre.
+        """
+        if shuffle:
+            rank = torch.rand(self.valid.shape, device=self.valid.device)
+        else:
+            rank = torch.rand(self.valid.shape[1], generator=torch.Generator().manual_seed(0)).to(self.valid.device)
+        wanted = min(count, self.valid.shape[1])
+        order = torch.where(self.valid, rank, 2.0).topk(wanted, dim=1, largest=False).indices
+        available = self.valid.sum(dim=1, keepdim=True).clamp(min=1)
+        chosen = order.gather(1, torch.arange(count, device=order.device)[None] % available)
+        points = torch.cat([self.position.to(self.color.dtype), self.color], dim=-1)
+        points = points.gather(1, chosen[..., None].expand(-1, -1, points.shape[-1]))
+        return points * self.valid.any(dim=1)[:, None, None]
+
+
+def cloud_from_depth(
+    rgb: Tensor, depth: Tensor, intrinsics: Tensor, world_from_cam: Tensor, workspace: Workspace, ceiling: Tensor
+) -> Cloud:
+    """Unproject RGBD images (paper Eq. 2 to 4) and keep what lies in the working volume and below a ceiling.
+
+    Args:
+        rgb: (B, 3, H, W) in [0, 1].
+        depth: (B, 1, H, W) metres along the optical axis; 0 and non-finite values are invalid.
+        intrinsics: (B, 9) row-major K, pixels.
+        world_from_cam: (B, 16) row-major poses.
+        workspace: the working volume.
+        ceiling: (B,) metres above the table, as for reprojection: it leaves out the arm.
+    """
+    batch, _, height, width = depth.shape
+    distance = depth[:, 0].double()
+    k, pose = intrinsics.double().view(batch, 3, 3), world_from_cam.double().view(batch, 4, 4)
+    v = torch.arange(height, dtype=torch.float64, device=depth.device)[:, None].expand(height, width)
+    u = torch.arange(width, dtype=torch.float64, device=depth.device)[None].expand(height, width)
+    pixel = torch.stack([u, v, torch.ones_like(u)], dim=-1).view(-1, 3)
+    rays = pixel @ torch.linalg.inv_ex(k).inverse.transpose(1, 2) @ pose[:, :3, :3].transpose(1, 2)
+    world = rays * distance.view(batch, -1, 1) + pose[:, None, :3, 3]
+    x, y, z = world.unbind(-1)
+    position = torch.stack([x - workspace.center[0], y - workspace.center[1], z], dim=-1)
+    half = workspace.size / 2
+    valid = (distance > 0) & torch.isfinite(distance)
+    valid = valid.flatten(1) & (position[..., :2].abs() < half).all(-1)
+    valid &= position[..., 2] < ceiling.double().clamp(max=workspace.height_limit)[:, None]
+    # points left out lie at the centre, so that no infinity reaches a network
+    position = torch.where(valid[..., None], position, 0.0)
+    return Cloud(position, rgb.flatten(2).transpose(1, 2), valid)

@@ -1,0 +1,1 @@
+"""Encoders of images, voxels and point clouds."""

@@ -1,0 +1,89 @@
+"""Demonstrations of a LeRobot dataset as transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from lerobot_symview import keys
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.runtime.staging import plain
+from symview_sim.settings import EnvSettings
+
+BATCH = 32
+REWARD, SUCCESS = "next.reward", "next.success"
+
+
+def open_dataset(target: DatasetTarget) -> Any:
+    """Return the `LeRobotDataset`, depth in metres.
+
+    Raises:
+        CommandError: if it is not there.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    folder = target.folder()
+    source = SourceDataset(folder)
+    dataset = LeRobotDataset(target.repo_id, root=folder, depth_output_unit="m", video_backend="pyav")
+    for key in (key for key, feature in source.features.items() if feature["dtype"] == "image"):
+        if any(chunk.field("bytes").null_count for chunk in dataset.hf_dataset.data.column(key).chunks):
+            raise CommandError(f"{key} of the dataset in {folder} names files, expected images in its tables")
+    return dataset
+
+
+def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
+    """Compare what a dataset says about its task, robot and camera with what is to be simulated.
+
+    Raises:
+        ValueError: naming the flags that differ.
+    """
+    simulated = {spec.name: spec for spec in (env.camera, *env.more_cameras)}
+    if camera not in simulated:
+        raise ValueError(f"--policy.camera={camera} is not simulated; --env.camera.name is {env.camera.name!r}")
+    info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
+    recorded = info.get("symview", {})
+    flags = {"task": env.task, "robot": env.robot}
+    pairs = {f"--env.{name}": (value, recorded[name]) for name, value in flags.items() if name in recorded}
+    for name, value in plain(asdict(simulated[camera])).items():
+        if name in recorded.get("placement", {}):
+            pairs[f"--env.camera.{name}"] = (value, recorded["placement"][name])
+    differing = [
+        f"{flag} is {ours!r}, theirs is {theirs!r}" for flag, (ours, theirs) in pairs.items() if ours != theirs
+    ]
+    if differing:
+        raise ValueError(f"the demonstrations are of another scene: {'; '.join(differing)}")
+
+
+def observations(dataset: Any) -> Iterator[tuple[dict[str, Tensor], Tensor]]:
+    """Yield batches of what was observed, as an environment would deliver it, and the actions (B, A)."""
+    for batch in DataLoader(dataset, batch_size=BATCH):
+        yield {name: value for name, value in batch.items() if name.startswith("observation.")}, batch[keys.ACTION]
+
+
+def outcomes(dataset: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return for every frame its reward, whether its episode ends there, and whether that is by success.
+
+    A dataset that does not say is taken for one of successes, with a reward of 1 at the end of every episode.
+    """
+    table = dataset.hf_dataset.with_format("numpy")
+    ends = np.append(np.diff(table["episode_index"][:]) != 0, True)
+    stated = {name: np.asarray(table[name][:]).reshape(-1) for name in (REWARD, SUCCESS) if name in table.column_names}
+    reward = stated.get(REWARD, ends).astype(np.float32)
+    return reward, ends, ends & stated.get(SUCCESS, ends).astype(bool)
+
+
+def ranges(dataset: Any, action_limits: tuple[NDArray, NDArray]) -> dict[str, dict[str, Tensor]]:
+    """Return the ranges that scale states, the dataset's, and actions, the environment's."""
+    states = dataset.meta.stats[keys.STATE]
+    return {
+        keys.STATE: {name: torch.as_tensor(states[name]) for name in ("min", "max")},
+        keys.ACTION: {name: torch.as_tensor(limit) for name, limit in zip(("min", "max"), action_limits, strict=True)},
+    }

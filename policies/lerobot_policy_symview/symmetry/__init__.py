@@ -1,0 +1,1 @@
+"""Planar groups, their representations, and augmentation by their elements."""

@@ -1,0 +1,126 @@
+"""Points and voxels of rendered scenes, and PointNet++'s choices, against slow references."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth
+from lerobot_policy_symview.inputs.voxels import voxelize
+from lerobot_policy_symview.nn.encoders.point_cloud import farthest_points, neighborhoods
+from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_symview.geometry.camera import unproject
+from lerobot_symview.geometry.workspace import Workspace
+from symview_sim.env import SymviewEnv
+from tests.conftest import make_camera
+
+WORKSPACE = Workspace()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A rendered frame of block stacking and its calibration."""
+    env = SymviewEnv("block_stacking")
+    observation, _ = env.reset(seed=3)
+    env.close()
+    return observation
+
+
+def make_cloud(scene, ceiling=1.0):
+    return cloud_from_depth(
+        torch.from_numpy(scene["pixels"]["side"]).permute(2, 0, 1)[None] / 255,
+        torch.from_numpy(scene["images.side_depth"])[None],
+        torch.from_numpy(scene["camera.side.intrinsics"])[None],
+        torch.from_numpy(scene["camera.side.world_from_cam"])[None],
+        WORKSPACE,
+        torch.tensor([ceiling]),
+    )
+
+
+def test_points_are_where_the_camera_module_says(scene):
+    cloud = make_cloud(scene)
+    camera = make_camera()
+    stored = scene["camera.side.world_from_cam"].reshape(4, 4).astype(np.float64)
+    camera = type(camera)(scene["camera.side.intrinsics"].reshape(3, 3).astype(np.float64), stored, 152, 152)
+    world = unproject(scene["images.side_depth"][0], camera).reshape(-1, 3)
+    expected = world - [*WORKSPACE.center, 0.0]
+    valid = cloud.valid[0].numpy()
+    np.testing.assert_allclose(cloud.position[0].numpy()[valid], expected[valid], atol=1e-6)
+    inside = (np.abs(expected[:, :2]) < 0.2).all(axis=1) & (expected[:, 2] < WORKSPACE.height_limit)
+    assert (valid == inside).mean() > 0.9999
+
+
+def test_the_ceiling_leaves_out_the_arm(scene):
+    low = make_cloud(scene, ceiling=0.06)
+    assert float(low.position[..., 2].max()) < 0.06
+    assert make_cloud(scene).valid.sum() > low.valid.sum() > 1000
+
+
+def test_invalid_depth_is_no_point():
+    camera = make_camera(size=8)
+    depth = torch.full((1, 1, 8, 8), torch.nan)
+    depth[..., 0, 0], depth[..., 0, 1], depth[..., 0, 2] = 0.0, torch.inf, -1.0
+    cloud = cloud_from_depth(
+        torch.rand(1, 3, 8, 8),
+        depth,
+        torch.tensor(camera.intrinsics).flatten()[None],
+        torch.tensor(camera.world_from_cam).flatten()[None],
+        WORKSPACE,
+        torch.tensor([1.0]),
+    )
+    assert not cloud.valid.any()
+    assert torch.isfinite(cloud.position).all()
+    assert (cloud.sample(16, shuffle=False) == 0).all()
+    assert (voxelize(cloud, WORKSPACE) == 0).all()
+
+
+def test_voxels_hold_the_mean_colour_of_their_points(scene):
+    cloud = make_cloud(scene)
+    grid = voxelize(cloud, WORKSPACE)[0].numpy()
+    expected: dict[tuple[int, ...], list[np.ndarray]] = {}
+    position, color = cloud.position[0].numpy(), cloud.color[0].numpy()
+    for point, shade in zip(position[cloud.valid[0]], color[cloud.valid[0]], strict=True):
+        x, y, z = math.floor(point[0] / 0.00625) + 32, math.floor(point[1] / 0.00625) + 32, round(point[2] / 0.00625)
+        if 0 <= z < 32:
+            expected.setdefault((z, x, y), []).append(shade)
+    assert grid[0].sum() == len(expected) > 500
+    for voxel, shades in expected.items():
+        np.testing.assert_allclose(grid[1:, *voxel], np.mean(shades, axis=0), atol=1e-5)
+
+
+def test_voxels_turn_with_the_scene(scene):
+    cloud = make_cloud(scene)
+    quarter = Motion(torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([True]))
+    moved = voxelize(cloud.moved(quarter), WORKSPACE)
+    torch.testing.assert_close(moved, torch.rot90(voxelize(cloud, WORKSPACE).flip(-1), 1, (-2, -1)))
+
+
+def test_sampled_points_are_valid_and_repeat_only_if_there_are_too_few(scene):
+    cloud = make_cloud(scene)
+    points = cloud.sample(1024, shuffle=False)
+    assert len({tuple(point) for point in points[0].tolist()}) == 1024
+    torch.testing.assert_close(points, cloud.sample(1024, shuffle=False))
+    assert not torch.equal(points, cloud.sample(1024, shuffle=True))
+    some = cloud.valid[0].nonzero()[:10, 0]
+    few = Cloud(cloud.position[:, some], cloud.color[:, some], torch.tensor([[True] * 3 + [False] * 7]))
+    repeated = few.sample(7, shuffle=True)[0, :, :3]
+    assert len({tuple(point) for point in repeated.tolist()}) == 3
+
+
+def test_farthest_points_and_neighborhoods_are_what_loops_find():
+    points = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(0))
+    chosen = farthest_points(points, 6)
+    for cloud, order in zip(points, chosen, strict=True):
+        taken = [0]
+        while len(taken) < 6:
+            distances = [min(float((cloud[i] - cloud[j]).norm()) for j in taken) for i in range(40)]
+            taken.append(int(np.argmax(distances)))
+        assert order.tolist() == taken
+    squared = torch.cdist(points[:, :5], points).square()
+    found = neighborhoods(squared.topk(8, largest=False), 0.3)
+    for scene_index in range(2):
+        for center in range(5):
+            within = [i for i in range(40) if squared[scene_index, center, i] <= 0.09]
+            nearest = sorted(within, key=lambda i: float(squared[scene_index, center, i]))[:8]
+            assert found[scene_index, center].tolist() == nearest + [center] * (8 - len(nearest))

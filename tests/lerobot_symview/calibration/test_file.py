@@ -1,0 +1,115 @@
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
+from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.geometry.workspace import Workspace, check_visible
+from lerobot_symview.runtime.cli import CommandError
+from tests.conftest import make_camera
+
+
+def content(**changes):
+    camera = make_camera(size=64)
+    front = {
+        "height": 64,
+        "width": 64,
+        "intrinsics": camera.intrinsics.tolist(),
+        "world_from_cam": camera.world_from_cam.tolist(),
+    }
+    return {"units": "m", "cameras": {"front": front | changes}}
+
+
+@pytest.mark.parametrize("write", [yaml.safe_dump, json.dumps])
+def test_a_file_is_yaml_or_json(tmp_path, write):
+    file = tmp_path / "cameras"
+    file.write_text(write(content() | {"workspace": {"center": [0.5, 0.1], "size": 0.3}}))
+    calibration = read_calibration(file)
+    np.testing.assert_allclose(calibration.camera("front").world_from_cam, make_camera().world_from_cam)
+    assert calibration.workspace == Workspace((0.5, 0.1), 0.3)
+    assert parse_calibration(plain_calibration(calibration)).workspace == calibration.workspace
+
+
+def test_poses_may_be_in_millimetres():
+    pose = make_camera(size=64).world_from_cam.copy()
+    pose[:3, 3] *= 1000
+    calibration = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": "mm"})
+    np.testing.assert_allclose(calibration.camera("front").position, make_camera().position)
+
+
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 1000.0)])
+def test_matrices_are_those_that_a_dataset_stores(units, scale):
+    pose = make_camera(17.0, 23.0, size=64).world_from_cam.copy()
+    pose[:3, 3] *= scale
+    parsed = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": units})
+    camera = parsed.camera("front")
+    for matrix in (camera.intrinsics, camera.world_from_cam):
+        np.testing.assert_array_equal(matrix, matrix.astype(np.float32))
+    again = parse_calibration(json.loads(json.dumps(plain_calibration(parsed)))).camera("front")
+    np.testing.assert_array_equal(again.world_from_cam, camera.world_from_cam)
+    np.testing.assert_array_equal(again.intrinsics, camera.intrinsics)
+
+
+def test_the_example_in_the_documentation_is_valid():
+    import lerobot_symview.calibration.file as module
+
+    example = module.__doc__.split("JSON:\n")[1]
+    camera = parse_calibration(yaml.safe_load(example)).camera("front")
+    check_visible("front", camera, Workspace(), "")
+
+
+REFLECTED = np.diag([1.0, -1.0, 1.0, 1.0]).tolist()
+STRETCHED = np.diag([1.1, 1.0, 1.0, 1.0]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ([], "expected a mapping"),
+        ({"cameras": content()["cameras"]}, "units must be m or mm, got None"),
+        (content() | {"units": "inch"}, "units must be m or mm, got 'inch'"),
+        ({"units": "m"}, "at least one camera"),
+        (content() | {"cameras": {"front": {}}}, "lacks height, width, intrinsics, world_from_cam"),
+        (content(fov=3), "unknown fov"),
+        (content() | {"camera": 1}, "unknown camera"),
+        (content(height=-3), "height must be a positive number of pixels, got -3"),
+        (content(intrinsics=[[1, 0], [0, 1]]), "intrinsics must be 3 rows of 3 numbers"),
+        (content(intrinsics=[[-60, 0, 31], [0, 60, 31], [0, 0, 1]]), "focal lengths must be positive"),
+        (content(intrinsics=[[60, 0, 310], [0, 60, 31], [0, 0, 1]]), r"principal point .* lies outside"),
+        (content(world_from_cam=REFLECTED), "left-handed"),
+        (content(world_from_cam=STRETCHED), "not orthonormal"),
+        (content(intrinsics=[[1e300, 0, 31], [0, 60, 31], [0, 0, 1]]), "must be finite"),
+        (content(world_from_cam="somewhere"), "world_from_cam must be 4 rows of 4 numbers"),
+        (content() | {"workspace": {"size": -1}}, "workspace: .*positive"),
+        (
+            content() | {"workspace": {"side": 1}},
+            "workspace: expected a mapping with any of center, size, height_limit",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(broken, message):
+    with pytest.raises(CalibrationError, match=message):
+        parse_calibration(broken)
+
+
+def test_everything_that_is_wrong_is_named_at_once():
+    broken = content(height=0) | {"units": "yard", "workspace": 3}
+    with pytest.raises(CalibrationError, match=r"units.*camera 'front'.*workspace"):
+        parse_calibration(broken)
+
+
+@pytest.mark.parametrize("text", ["units: [", "\x00"])
+def test_a_file_that_cannot_be_read_is_named(tmp_path, text):
+    file = tmp_path / "cameras.yaml"
+    file.write_text(text)
+    with pytest.raises(CommandError, match=r"cannot read --calibration=.*cameras\.yaml"):
+        read_calibration(file)
+    with pytest.raises(CommandError, match="cannot read --calibration"):
+        read_calibration(tmp_path / "nowhere.yaml")
+
+
+def test_an_unknown_camera_is_answered_with_the_known():
+    with pytest.raises(CalibrationError, match="no camera 'side'; it has front"):
+        parse_calibration(content()).camera("side")

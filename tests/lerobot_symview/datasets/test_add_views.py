@@ -1,0 +1,220 @@
+import json
+import shutil
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset
+from lerobot.scripts import lerobot_train
+
+from lerobot_symview import keys
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.views import VIEWS, Frame, make_view
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+from tests.conftest import VIEW_SIZE
+from tests.lerobot_symview.derived import contents, images_of, views_config
+
+
+def parquet_columns(folder):
+    tables = [pq.read_table(path) for path in sorted((folder / "data").rglob("*.parquet"))]
+    assert len(tables) == 1
+    return tables[0]
+
+
+def test_every_original_column_is_kept_bit_for_bit(recorded, with_views):
+    before, after = parquet_columns(recorded), parquet_columns(with_views)
+    for name in before.column_names:
+        assert before[name].to_pylist() == after[name].to_pylist(), name
+
+
+def test_views_are_those_of_each_frame(recorded, with_views):
+    source = LeRobotDataset("test/recorded", root=recorded, depth_output_unit="m")
+    result = LeRobotDataset("test/with_views", root=with_views, depth_output_unit="m")
+    assert len(result) == len(source)
+    for index in (0, 3, len(source) - 1):
+        item = source[index]
+        rgb = (item[keys.rgb("side")] * 255).round().byte().permute(1, 2, 0).numpy()
+        frame = Frame(
+            rgb,
+            item[keys.depth("side")][0].numpy(),
+            Camera(
+                item[keys.intrinsics("side")].numpy().reshape(3, 3),
+                item[keys.world_from_cam("side")].numpy().reshape(4, 4),
+                *rgb.shape[:2],
+            ),
+            Workspace(),
+            item[keys.STATE].numpy(),
+        )
+        for name in VIEWS:
+            for output, image in make_view(name, size=VIEW_SIZE).render(frame).items():
+                stored = result[index][keys.view("side", output)].numpy()
+                expected = image.transpose(2, 0, 1) / np.float32(255) if image.ndim == 3 else image[None]
+                np.testing.assert_array_equal(stored, expected, err_msg=output)
+
+
+def test_statistics_cover_the_new_keys(with_views):
+    stats = json.loads((with_views / "meta" / "stats.json").read_text())
+    dataset = LeRobotDataset("test/with_views", root=with_views, depth_output_unit="m")
+    for name in VIEWS:
+        for output in make_view(name).outputs:
+            key = keys.view("side", output)
+            values = np.stack([dataset[i][key].numpy() for i in range(len(dataset))])
+            axes = (0, 2, 3)
+            np.testing.assert_allclose(np.squeeze(stats[key]["min"]), np.squeeze(values.min(axes)), atol=1e-6)
+            np.testing.assert_allclose(np.squeeze(stats[key]["mean"]), np.squeeze(values.mean(axes)), rtol=1e-3)
+            np.testing.assert_allclose(np.squeeze(stats[key]["std"]), np.squeeze(values.std(axes)), rtol=1e-2)
+
+
+def test_the_statistics_of_depth_stay_in_metres(recorded, with_views):
+    before, after = (json.loads((folder / "meta" / "stats.json").read_text()) for folder in (recorded, with_views))
+    for key in (keys.depth("side"), keys.depth("top"), keys.ACTION):
+        np.testing.assert_allclose(after[key]["max"], before[key]["max"])
+
+
+def test_a_view_says_how_it_was_made(with_views):
+    features = json.loads((with_views / "meta" / "info.json").read_text())["features"]
+    made = features["observation.images.side_reproj"]["info"]["symview"]
+    assert make_view(made["view"], **made["options"]) == make_view("reproj", size=VIEW_SIZE)
+    assert made["workspace"] == {"center": [0.45, 0.0], "size": 0.4, "height_limit": 0.25}
+
+
+def test_keep_drops_the_other_images(only_views):
+    dataset = LeRobotDataset("test/only_views", root=only_views)
+    assert sorted(dataset.meta.camera_keys) == [
+        "observation.images.side_reproj",
+        "observation.images.side_reproj_height",
+    ]
+    assert keys.intrinsics("side") in dataset.meta.features
+
+
+def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, with_views):
+    before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
+    with pytest.raises(CommandError, match="exists already"):
+        add_views(AddViewsConfig(PushedDataset("test/recorded", recorded), new_root=with_views))
+    assert {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"camera": "wrist"}, ValueError, "calibrated cameras: .*side"),
+        ({"keep": ["front"]}, ValueError, "--keep names .*front"),
+        ({"dataset": DatasetTarget("no/where")}, CommandError, "there is no dataset in"),
+    ],
+)
+def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, options, error, message):
+    target = tmp_path / "target"
+    config = AddViewsConfig(**({"dataset": PushedDataset("test/recorded", recorded), "new_root": target} | options))
+    with pytest.raises(error, match=message):
+        add_views(config)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
+    """Of lossless videos the views are those of the images; depth, stored in steps, moves few points."""
+    env = RecordedEnv(camera=CameraSpec(height=64, width=64), oracle=False)
+    folders = {}
+    for video in (False, True):
+        target = NewDataset("test/recorded", tmp_path / f"source-{video}")
+        source = generate(GenerateConfig(target, env=env, num_episodes=2, video=video))
+        folders[video] = add_views(views_config(source, tmp_path / f"views-{video}"))
+    copied = {path: data for path, data in contents(folders[True]).items() if path.suffix == ".mp4"}
+    assert copied
+    assert copied == {path: data for path, data in contents(tmp_path / "source-True").items() if path.suffix == ".mp4"}
+    key = keys.view("side", "persp")
+    np.testing.assert_array_equal(images_of(folders[True], key), images_of(folders[False], key))
+    key = keys.view("side", "reproj_height")
+    difference = np.abs(images_of(folders[True], key) - images_of(folders[False], key))
+    assert (difference > 3e-4).mean() < 0.02
+    source = tmp_path / "source-True"
+    only = add_views(views_config(source, tmp_path / "only", keep=[]))
+    assert not (only / "videos").exists()
+    np.testing.assert_array_equal(images_of(only, key), images_of(folders[True], key))
+    lost = next((source / "videos" / keys.depth("side")).rglob("*.mp4"))
+    lost.unlink()
+    with pytest.raises(CommandError, match=rf"lacks videos/{keys.depth('side')}/.*file-000\.mp4: download or copy"):
+        add_views(views_config(source, tmp_path / "never"))
+    assert not (tmp_path / "never.partial").exists()
+    add_views(views_config(source, tmp_path / "without_depth", views=["persp"], keep=[]))  # which that video is not for
+
+
+@pytest.mark.parametrize("views", [[], ["reprojection"]])
+def test_unknown_views_are_refused_before_anything_is_read(views):
+    with pytest.raises(ValueError, match=r"view"):
+        AddViewsConfig(PushedDataset("a/b"), views=views)
+
+
+@pytest.mark.parametrize("name", ["views", "me/", "a/b/c"])
+def test_a_wrong_name_of_the_result_names_its_flag(name):
+    with pytest.raises(ValueError, match=f"--new_repo_id must look like user/name, got '{name}'"):
+        AddViewsConfig(PushedDataset("a/b"), new_repo_id=name)
+
+
+@pytest.mark.parametrize("place", ["source/views", "source/meta/views", "source", ".", "link/views"])
+def test_source_and_result_do_not_lie_in_each_other(recorded, tmp_path, place):
+    source = tmp_path / "source"
+    shutil.copytree(recorded, source)
+    (tmp_path / "link").symlink_to(source)
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="neither may lie in the other, choose another --new_root"):
+        add_views(views_config(source, tmp_path / place))
+    assert contents(tmp_path) == before
+
+
+def test_a_source_is_not_where_the_result_is_made(recorded, tmp_path):
+    source = tmp_path / "views.partial" / "source"
+    shutil.copytree(recorded, source)
+    with pytest.raises(ValueError, match="choose another --new_root"):
+        add_views(views_config(source, tmp_path / "views"))
+
+
+def test_lerobots_own_act_trains_on_what_is_made_for_stock_policies(recorded, tmp_path, monkeypatch):
+    source = views_config(recorded, tmp_path / "stock", for_stock_policies=True)
+    dataset = LeRobotDataset("test/stock", root=add_views(source))
+    assert set(dataset.meta.camera_keys) == {keys.view("side", name) for name in ("reproj", "persp", "persp_gripper")}
+    assert set(dataset.meta.stats) == set(dataset.meta.features)
+    made = dataset.meta.features[keys.view("side", "reproj")]["info"]["symview"]
+    assert make_view(made["view"], **made["options"]).outputs == {"reproj": "rgb"}
+    arguments = ["--dataset.repo_id=test/stock", f"--dataset.root={tmp_path / 'stock'}", "--policy.type=act"]
+    arguments += ["--policy.push_to_hub=false", "--policy.device=cpu", "--policy.pretrained_backbone_weights=null"]
+    arguments += ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=4"]
+    arguments += ["--policy.n_action_steps=4", "--steps=2", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0"]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments, f"--output_dir={tmp_path / 'act'}"])
+    lerobot_train.main()
+    assert (tmp_path / "act" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_a_camera_may_be_kept_for_stock_policies(recorded, tmp_path):
+    config = views_config(recorded, tmp_path / "stock", for_stock_policies=True, views=["reproj"], keep=["side"])
+    images = LeRobotDataset("test/stock", root=add_views(config)).meta.camera_keys
+    assert set(images) == {keys.rgb("side"), keys.view("side", "reproj")}
+
+
+def test_a_view_of_one_channel_is_refused_for_stock_policies(monkeypatch):
+    @dataclass(frozen=True)
+    class Metres:
+        size: int = 8
+        outputs = {"metres": "height"}  # noqa: RUF012
+
+    monkeypatch.setitem(VIEWS, "metres", Metres)
+    AddViewsConfig(PushedDataset("a/b"), views=["metres"])
+    with pytest.raises(ValueError, match="the view 'metres' has one in metres: take it out of --views"):
+        AddViewsConfig(PushedDataset("a/b"), views=["metres"], for_stock_policies=True)
+
+
+@pytest.mark.parametrize("file", ["meta/stats.json", "data/chunk-000/file-000.parquet"])
+def test_a_file_that_the_source_lacks_is_named_before_any_work(recorded, tmp_path, file):
+    source = tmp_path / "source"
+    shutil.copytree(recorded, source)
+    (source / file).unlink()
+    with pytest.raises(CommandError, match=rf"dataset in .* lacks {file}: download or copy it again"):
+        add_views(views_config(source, tmp_path / "never"))
+    assert list(tmp_path.iterdir()) == [source]

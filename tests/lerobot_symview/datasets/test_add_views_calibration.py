@@ -1,0 +1,272 @@
+"""Whose camera the views of a dataset are made by: the dataset's own, one that moves, one in a file; what they show."""
+
+import json
+import re
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+from lerobot.datasets import LeRobotDataset, modify_features
+
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import (
+    Calibration,
+    parse_calibration,
+    parse_workspace,
+    plain_calibration,
+    read_calibration,
+)
+from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.datasets.features import camera_features
+from lerobot_symview.datasets.source import vectors
+from lerobot_symview.geometry.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views import VIEWS, Frame, make_view
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+from tests.conftest import VIEW_SIZE
+from tests.lerobot_symview.derived import images_of, views_config
+from tests.lerobot_symview.test_upsampling import plane_depth
+
+NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
+
+
+def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
+    """A dataset without calibration gets the same views from a file, and the calibration with them."""
+    source = LeRobotDataset("test/recorded", root=recorded)
+    calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
+    matrices = {key: source[0][key].tolist() for key in calibrations}
+    modify_features(source, remove_features=calibrations, output_dir=tmp_path / "bare", repo_id="test/bare")
+    with pytest.raises(ValueError, match=r"lacks observation\.camera.*calibrated cameras: none, see --calibration"):
+        add_views(views_config(tmp_path / "bare", tmp_path / "never"))
+    side = {"height": 152, "width": 152, "intrinsics": np.reshape(matrices[keys.intrinsics("side")], (3, 3)).tolist()}
+    side["world_from_cam"] = np.reshape(matrices[keys.world_from_cam("side")], (4, 4)).tolist()
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump({"units": "m", "cameras": {"side": side}}))
+    result = add_views(views_config(tmp_path / "bare", tmp_path / "derived", calibration=file))
+    for name in VIEWS:
+        for output in make_view(name).outputs:
+            key = keys.view("side", output)
+            np.testing.assert_array_equal(images_of(result, key), images_of(with_views, key))
+    dataset = LeRobotDataset("test/derived", root=result)
+    assert dataset[0][keys.world_from_cam("side")].tolist() == matrices[keys.world_from_cam("side")]
+    assert dataset.meta.stats[keys.intrinsics("side")]["std"].tolist() == [0.0] * 9
+    with pytest.raises(ValueError, match=r"has observation\.camera\.side\.intrinsics.* already"):
+        add_views(views_config(recorded, tmp_path / "never", calibration=file))
+    file.write_text(yaml.safe_dump({"units": "m", "cameras": {"side": side | {"height": 76, "width": 76}}}))
+    with pytest.raises(CalibrationError, match=r"principal point|152 x 152"):
+        add_views(views_config(tmp_path / "bare", tmp_path / "never", calibration=file))
+    assert not list(tmp_path.glob("never*"))
+
+
+def test_a_camera_that_moves_is_followed(tmp_path):
+    camera = CameraSpec(height=64, width=64, spread=CameraSpread(azimuth_deg=180.0, elevation_deg=20.0))
+    env = RecordedEnv(camera=camera, oracle=False)
+    target = NewDataset("test/recorded", tmp_path / "moving")
+    source = LeRobotDataset("test/moving", root=generate(GenerateConfig(target, env=env, num_episodes=2)))
+    result = LeRobotDataset("test/v", root=add_views(views_config(tmp_path / "moving", tmp_path / "derived")))
+    key = keys.world_from_cam("side")
+    assert (source[0][key] != source[len(source) - 1][key]).any()
+    for index in (0, len(source) - 1):
+        item = source[index]
+        camera = stored_camera(item[keys.intrinsics("side")].numpy(), item[key].numpy(), 64, 64)
+        rgb = (item[keys.rgb("side")] * 255).round().byte().permute(1, 2, 0).numpy()
+        frame = Frame(rgb, None, camera, Workspace(), item[keys.STATE].numpy())
+        expected = make_view("persp", size=VIEW_SIZE).render(frame)["persp"]
+        stored = (result[index][keys.view("side", "persp")] * 255).round().byte().permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(stored, expected)
+
+
+def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
+    """On a wrist, say: every frame's reprojection is made with the pose of that frame."""
+    source = LeRobotDataset.create(
+        "test/wrist",
+        fps=10,
+        root=tmp_path / "wrist",
+        use_videos=False,
+        features=camera_features("wrist", 48, 64, {})
+        | {keys.ACTION: {"dtype": "float32", "shape": (1,), "names": None}},
+    )
+    rng, expected = np.random.default_rng(0), []
+    view = make_view("reproj", size=32, clip="none")
+    for azimuth in np.linspace(0, 2, 6):
+        pose = orbit_pose(0.8, azimuth, 0.6 + 0.1 * azimuth, (0.45, 0.0, 0.0)).astype(np.float32)
+        intrinsics = intrinsics_from_fov(0.9, 48, 64).astype(np.float32)
+        camera = stored_camera(intrinsics.ravel(), pose.ravel(), 48, 64)
+        rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        depth = plane_depth(camera, height=0.03).astype(np.float32)
+        expected.append(view.render(Frame(rgb, depth, camera, Workspace())))
+        frame = {keys.rgb("wrist"): rgb, keys.depth("wrist"): depth[..., None], keys.ACTION: np.zeros(1, np.float32)}
+        calibration = {keys.intrinsics("wrist"): intrinsics.ravel(), keys.world_from_cam("wrist"): pose.ravel()}
+        source.add_frame(frame | calibration | {"task": "nothing"})
+    source.save_episode()
+    source.finalize()
+    config = views_config(
+        tmp_path / "wrist", tmp_path / "derived", camera="wrist", views=["reproj"], size=None, reproj=view
+    )
+    result = add_views(config)
+    colors = np.rint(255 * images_of(result, keys.view("wrist", "reproj"))).astype(np.uint8).transpose(0, 2, 3, 1)
+    heights = images_of(result, keys.view("wrist", "reproj_height"))[:, 0]
+    for index, images in enumerate(expected):
+        np.testing.assert_array_equal(colors[index], images["reproj"])
+        np.testing.assert_array_equal(heights[index], images["reproj_height"])
+        assert index == 0 or (colors[index] != colors[index - 1]).any()
+
+
+def record_real_robot(folder, camera, rgb, use_videos=False):
+    """Write three frames with joint angles and depth in uint16 millimetres, as a RealSense gives it; return that."""
+    size = (camera.height, camera.width)
+    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
+    kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
+    source = LeRobotDataset.create(
+        "test/real",
+        fps=10,
+        root=folder,
+        use_videos=use_videos,
+        features={
+            keys.STATE: joints,
+            keys.ACTION: joints,
+            keys.rgb("front"): {"dtype": kind, "shape": (*size, 3), "names": axes},
+            keys.depth("front"): {
+                "dtype": "image",
+                "shape": (*size, 1),
+                "names": axes,
+                "info": {"is_depth_map": True},
+            },
+        },
+    )
+    depth = np.rint(1000 * plane_depth(camera, height=0.02)).astype(np.uint16)[..., None]
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        angles = rng.normal(size=6).astype(np.float32)
+        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
+        source.add_frame(frame | {"task": "nothing"})
+    source.save_episode()
+    source.finalize()
+    return depth
+
+
+@pytest.mark.parametrize("use_videos", [False, True])
+def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
+    camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
+    rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
+    record_real_robot(tmp_path / "real", camera, rgb, use_videos)
+    file = tmp_path / "cameras.json"
+    calibration = Calibration({"front": camera}, Workspace(size=0.3))
+    file.write_text(json.dumps(plain_calibration(calibration)))
+    options = {"reproj": make_view("reproj", clip="none", source_scale=3), "persp": make_view("persp", gripper=False)}
+    result = add_views(
+        views_config(tmp_path / "real", tmp_path / "derived", camera="front", calibration=file, **options)
+    )
+    heights = images_of(result, keys.view("front", "reproj_height"))
+    np.testing.assert_allclose(heights, 0.02, atol=0.001)
+    for name in ("reproj", "persp"):
+        color = images_of(result, keys.view("front", name)) * 255
+        assert np.abs(color - np.reshape([200, 100, 50], (1, 3, 1, 1))).max() <= (4 if use_videos else 0.01)
+    facts = json.loads((result / "meta" / "info.json").read_text())["features"][keys.view("front", "reproj")]["info"]
+    assert facts["symview"]["workspace"]["size"] == 0.3
+    assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
+
+
+def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_same_bits(tmp_path):
+    camera = Camera(intrinsics_from_fov(0.83, 96, 128), orbit_pose(0.91, 0.37, 0.81, (0.45, 0.01, 0.0)), 96, 128)
+    rgb = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
+    depth = record_real_robot(tmp_path / "real", camera, rgb)
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(plain_calibration(Calibration({"front": camera}))))
+    options = {"reproj": {"size": VIEW_SIZE, "clip": "none"}, "persp": {"size": VIEW_SIZE, "gripper": False}}
+    views = {name: make_view(name, **chosen) for name, chosen in options.items()}
+    made = add_views(
+        views_config(tmp_path / "real", tmp_path / "derived", camera="front", calibration=file, size=None, **views)
+    )
+    item = LeRobotDataset("test/derived", root=made, depth_output_unit="m")[0]
+    matrices = {key: item[key] for key in (keys.intrinsics("front"), keys.world_from_cam("front"))}
+    observed = {
+        keys.rgb("front"): torch.from_numpy(rgb).permute(2, 0, 1)[None],
+        keys.depth("front"): torch.from_numpy(depth).permute(2, 0, 1)[None],
+    }
+    online = ViewsProcessorStep(options, "front", calibration=plain_calibration(read_calibration(file)))
+    recomputed = Frame(rgb, depth[..., 0], stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace())
+    for observation in (dict(observed), observed | matrices):
+        images = online.observation(observation)
+        for view in views.values():
+            for output, again in view.render(recomputed).items():
+                key = keys.view("front", output)
+                again = again.transpose(2, 0, 1) / np.float32(255) if again.ndim == 3 else again[None]
+                np.testing.assert_array_equal(images[key][0].numpy(), item[key].numpy(), err_msg=key)
+                np.testing.assert_array_equal(again, item[key].numpy(), err_msg=key)
+
+
+def test_without_the_grippers_pose_the_flags_that_do_without_are_named(recorded, tmp_path):
+    source = tmp_path / "joints"
+    shutil.copytree(recorded, source)
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["features"][keys.STATE]["names"] = [f"joint_{i}" for i in range(5)]
+    (source / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match=r"x, y, z, yaw, aperture among the names.*--reproj\.clip.*--persp\.gripper"):
+        add_views(views_config(source, tmp_path / "derived"))
+    options = {"reproj": make_view("reproj", clip=0.2), "persp": make_view("persp", gripper=False)}
+    add_views(views_config(source, tmp_path / "derived", **options))
+
+
+def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
+    source = tmp_path / "broken"
+    shutil.copytree(recorded, source)
+    file = next(source.rglob("data/**/*.parquet"))
+    table = pq.read_table(file)
+    poses = vectors(table, keys.world_from_cam("side")).copy()
+    poses[4, 0] += 0.3
+    column = pa.FixedSizeListArray.from_arrays(pa.array(poses.ravel()), 16)
+    index = table.column_names.index(keys.world_from_cam("side"))
+    pq.write_table(table.set_column(index, table.schema.field(index), column), file)
+    with pytest.raises(CalibrationError, match=r"episode 0, frame 4, camera 'side': .*not orthonormal"):
+        add_views(views_config(source, tmp_path / "derived"))
+
+
+def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
+    camera = Camera(intrinsics_from_fov(0.8, 152, 152), orbit_pose(0.9, 0.4, 0.8, (2.0, 0.0, 0.0)), 152, 152)
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}))))
+    with pytest.raises(
+        CalibrationError, match=r"'side' sees 0% of the workspace, .*check the poses in .*cameras\.json"
+    ):
+        add_views(views_config(recorded, tmp_path / "derived", calibration=file))
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_recorded_camera_that_sees_too_little_is_warned_of(recorded, tmp_path, caplog):
+    with caplog.at_level("WARNING", logger="lerobot_symview.datasets.add_views"):
+        add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
+    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty where it sees none", caplog.text)
+
+
+def test_the_workspace_is_the_flags_then_the_files_then_the_datasets(recorded, tmp_path):
+    bare, file = tmp_path / "bare", tmp_path / "cameras.json"
+    source = LeRobotDataset("test/recorded", root=recorded)
+    calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
+    modify_features(source, remove_features=calibrations, output_dir=bare, repo_id="test/bare")
+    matrices = [source[0][key("side")].numpy() for key in (keys.intrinsics, keys.world_from_cam)]
+    camera = stored_camera(*matrices, 152, 152)
+    stated, in_file, in_dataset = Workspace((0.5, 0.1), 0.3), Workspace(size=0.35), Workspace()
+    made = {}
+    for name, data, workspace, more in (
+        ("flag", recorded, stated, {"workspace": stated}),
+        ("dataset", recorded, in_dataset, {}),
+        ("flag_before_file", bare, stated, {"workspace": stated, "calibration": file}),
+        ("file", bare, in_file, {"calibration": file}),
+    ):
+        file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}, in_file))))
+        result = add_views(views_config(data, tmp_path / name, views=["persp"], persp=NO_GRIPPER, size=None, **more))
+        info = json.loads((result / "meta" / "info.json").read_text())
+        facts = info["features"][keys.view("side", "persp")]["info"]["symview"]
+        assert parse_workspace(facts["workspace"]) == workspace, name
+        made[name] = images_of(result, keys.view("side", "persp"))
+    np.testing.assert_array_equal(made["flag"], made["flag_before_file"])
+    for name in ("dataset", "file"):
+        assert (made[name] != made["flag"]).any()

@@ -1,0 +1,193 @@
+"""Parts, interruptions and processes: whatever happens, the same bytes."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset, aggregate_datasets
+
+from lerobot_symview import keys
+from lerobot_symview.datasets import derivation
+from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.runtime.cli import CommandError
+from tests.conftest import VIEW_SIZE, largest_file
+from tests.lerobot_symview.derived import contents, views_config
+
+
+@pytest.fixture
+def small_parts(monkeypatch):
+    """A part for every episode."""
+    monkeypatch.setattr(derivation, "PART_FRAMES", 1)
+
+
+@pytest.fixture
+def reference(recorded, small_parts, tmp_path):
+    """What an undisturbed process writes."""
+    return contents(add_views(views_config(recorded, tmp_path / "reference")))
+
+
+@pytest.fixture
+def several_files(recorded, tmp_path):
+    """A dataset of three times two episodes, in a file of their own each time, and so in three parts."""
+    folder = tmp_path / "several"
+    names = ["test/recorded"] * 3
+    aggregate_datasets(names, "test/several", [recorded] * 3, folder, concatenate_data=False)
+    assert len(list(folder.glob("data/*/*.parquet"))) == 3
+    return folder
+
+
+def test_the_number_of_processes_does_not_change_a_byte(recorded, reference, tmp_path):
+    assert contents(add_views(views_config(recorded, tmp_path / "derived", num_workers=2))) == reference
+
+
+def test_parts_are_cut_at_episodes_within_files(recorded, small_parts):
+    source = SourceDataset(recorded)
+    assert derivation.cut_parts(source) == [range(0, 1), range(1, 2)]
+
+
+def test_an_interrupted_run_goes_on(recorded, reference, tmp_path, monkeypatch):
+    target, written = tmp_path / "derived", []
+
+    def fail_at_the_second(one, part):
+        if written:
+            raise KeyboardInterrupt
+        written.append(part)
+        return derivation.write_part(one, part)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot_symview.datasets.add_views.write_part", fail_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            add_views(views_config(recorded, target))
+    assert not target.exists()
+    with pytest.raises(CommandError, match="begun and interrupted: add --resume=true"):
+        add_views(views_config(recorded, target))
+    with pytest.raises(CommandError, match="begun with another views: repeat the command"):
+        add_views(views_config(recorded, target, size=VIEW_SIZE + 2, resume=True))
+    kept = next((tmp_path / "derived.partial").rglob("*.parquet"))
+    written_at = kept.stat().st_mtime_ns
+    add_views(views_config(recorded, target, resume=True))
+    assert contents(target) == reference
+    assert (target / kept.relative_to(tmp_path / "derived.partial" / "dataset")).stat().st_mtime_ns == written_at
+    before = contents(target)
+    add_views(views_config(recorded, target, resume=True))  # complete already
+    assert contents(target) == before
+    assert not (tmp_path / "derived.partial").exists()
+
+
+FORKING = f"""
+import os, pathlib, sys
+import cv2, datasets
+from lerobot_symview.datasets import add_views, derivation
+from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.views import *
+from tests.lerobot_symview.test_views import make_frame
+cv2.setNumThreads(0)  # threads do not survive a fork
+for name in VIEWS:  # compiled once
+    make_view(name).render(make_frame())
+source, target = map(pathlib.Path, sys.argv[1:])
+for _ in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        derivation.PART_FRAMES = 1
+        add_views.add_views(add_views.AddViewsConfig(
+            PushedDataset('test/recorded', source), new_repo_id='test/derived', new_root=target,
+            views=['reproj', 'persp'], size={VIEW_SIZE}, resume=True))
+        os._exit(0)
+    print(child, flush=True)
+    print(os.waitpid(child, 0)[1], flush=True)
+"""
+
+
+def test_a_killed_process_loses_nothing_finished(recorded, reference, tmp_path):
+    """SIGKILL at random moments, a little later each time, until one run gets to the end."""
+    target = tmp_path / "derived"
+    rng, kills = np.random.default_rng(0), 0
+    command = [sys.executable, "-c", FORKING, str(recorded), str(target)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as forking:
+        for attempt in range(40):
+            forking.stdin.write(b"go\n")
+            forking.stdin.flush()
+            child = int(forking.stdout.readline())
+            time.sleep(0.05 * attempt + rng.uniform(0, 0.1))
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+            status = int(forking.stdout.readline())
+            if status == 0:
+                break
+            assert status == signal.SIGKILL
+            kills += 1
+            assert not target.exists() or contents(target) == reference
+    assert contents(target) == reference
+    assert kills > 0
+
+
+def test_a_full_disk_is_reported_and_the_run_goes_on_later(recorded, reference, tmp_path):
+    target = tmp_path / "derived"
+    with largest_file(30_000), pytest.raises(CommandError, match=r"cannot write to .*MiB free.*--resume=true"):
+        add_views(views_config(recorded, target))
+    assert not target.exists()
+    add_views(views_config(recorded, target, resume=True))
+    assert contents(target) == reference
+
+
+def test_tables_are_read_however_their_row_groups_are_cut(recorded, reference, tmp_path):
+    source = tmp_path / "recut"
+    shutil.copytree(recorded, source)
+    file = next(source.rglob("data/**/*.parquet"))
+    pq.write_table(pq.read_table(file), file, row_group_size=5)
+    result = add_views(views_config(source, tmp_path / "derived"))
+    for path, data in reference.items():
+        if path.parts[0] == "data":
+            assert (result / path).read_bytes() == data
+
+
+def test_a_source_of_several_files_has_the_views_of_each(several_files, with_views, tmp_path):
+    result = LeRobotDataset("test/derived", root=add_views(views_config(several_files, tmp_path / "derived")))
+    once = LeRobotDataset("test/with_views", root=with_views)
+    assert len(result) == 3 * len(once)
+    assert len(list(result.root.glob("data/*/*.parquet"))) == 3
+    images = [
+        key for key in once.meta.camera_keys if key.startswith((keys.view("side", "reproj"), keys.view("side", "p")))
+    ]
+    for index in range(len(result)):
+        copy, original = result[index], once[index % len(once)]
+        assert int(copy["index"]) == index
+        for key in images:
+            assert (copy[key] == original[key]).all(), (index, key)
+    for key in images:
+        np.testing.assert_allclose(result.meta.stats[key]["mean"], once.meta.stats[key]["mean"], rtol=1e-6)
+        assert result.meta.stats[key]["count"] == 3 * once.meta.stats[key]["count"]
+    for episode in range(6):
+        place = result.meta.get_data_file_path(episode)
+        assert episode in pq.read_table(result.root / place, columns=["episode_index"])["episode_index"].to_pylist()
+
+
+def test_two_killed_processes_lose_nothing_finished(several_files, tmp_path):
+    """SIGKILL before, amid and after the parts; then to the end, with the bytes of an undisturbed run."""
+    target, partial = tmp_path / "derived", tmp_path / "derived.partial"
+    command = [Path(sys.executable).parent / "symview-add-views", "--dataset.repo_id=test/recorded"]
+    command += [f"--root={several_files}", "--new_repo_id=test/derived", f"--new_root={target}", "--resume=true"]
+    command += ["--views=[reproj, persp]", f"--size={VIEW_SIZE}", "--num_workers=2"]
+    moments = [lambda: partial.exists(), lambda: any(partial.glob("dataset/data/*/*.parquet"))]
+    rng = np.random.default_rng(0)
+    for moment in moments:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while not moment():
+            assert process.poll() is None
+            time.sleep(0.005)
+        time.sleep(rng.uniform(0, 0.05))
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        assert not target.exists()
+    subprocess.run(command, check=True, capture_output=True)
+    assert not partial.exists()
+    assert contents(target) == contents(add_views(views_config(several_files, tmp_path / "undisturbed")))

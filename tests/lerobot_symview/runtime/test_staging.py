@@ -1,0 +1,83 @@
+"""What is removed, gone on with, or left alone in `<target>.partial`."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.runtime.staging import DONE, REQUEST, is_complete, open_partial, remove_partial
+from tests.lerobot_symview.derived import contents, views_config
+
+DESCRIPTION = {"source": "test/recorded", "size": 76}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "target.partial"
+
+
+@pytest.mark.parametrize("resume", [False, True])
+@pytest.mark.parametrize("name", ["notes.txt", REQUEST, "dataset/photo.png"])
+def test_what_somebody_keeps_there_is_left_alone(recorded, tmp_path, name, resume):
+    kept = tmp_path / "derived.partial" / name
+    kept.parent.mkdir(parents=True)
+    kept.write_text("years of work")
+    with pytest.raises(CommandError, match=rf"no command of ours put there \({Path(name).parts[0]}\): move it"):
+        add_views(views_config(recorded, tmp_path / "derived", resume=resume))
+    assert kept.read_text() == "years of work"
+    assert not (tmp_path / "derived").exists()
+
+
+def test_a_file_of_that_name_is_left_alone(folder):
+    folder.write_text("years of work")
+    with pytest.raises(CommandError, match="it is a file"):
+        open_partial(folder, DESCRIPTION, resume=True)
+    assert folder.read_text() == "years of work"
+
+
+def test_a_complete_target_does_not_remove_what_somebody_keeps_beside_it(folder, tmp_path):
+    meta = tmp_path / "target" / "meta"
+    for kept in (meta, folder):
+        kept.mkdir(parents=True)
+    (meta / "made.json").write_text('{"source": "test/recorded", "size": 76}')
+    (folder / "notes.txt").write_text("years of work")
+    assert is_complete(tmp_path / "target", "made.json", DESCRIPTION, True, "--new_root")
+    assert (folder / "notes.txt").exists()
+
+
+def test_what_a_command_killed_at_its_beginning_left_is_used(folder):
+    folder.mkdir()
+    (folder / f"{REQUEST}.0123.part").write_text("{")
+    open_partial(folder, DESCRIPTION, resume=False)
+    assert (folder / REQUEST).exists()
+
+
+def test_an_interrupted_removal_is_finished_and_not_gone_on_with(folder, monkeypatch):
+    open_partial(folder, DESCRIPTION, resume=False)
+    (folder / "pieces").mkdir()
+    (folder / "pieces" / "0").write_text("half of it is gone")
+
+    def interrupted(path):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(shutil, "rmtree", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            remove_partial(folder)
+    assert {path.name for path in folder.iterdir()} == {DONE, "pieces"}
+    open_partial(folder, DESCRIPTION, resume=True)
+    assert [path.name for path in folder.iterdir()] == [REQUEST]
+
+
+def test_a_run_killed_before_it_cleaned_up_is_complete(recorded, tmp_path, monkeypatch):
+    target, folder = tmp_path / "derived", tmp_path / "derived.partial"
+    with monkeypatch.context() as patched:
+        patched.setattr("lerobot_symview.datasets.add_views.remove_partial", lambda folder: None)
+        add_views(views_config(recorded, target))
+    before = contents(target)
+    assert folder.exists()
+    add_views(views_config(recorded, target, resume=True))
+    assert contents(target) == before
+    assert not folder.exists()

@@ -1,0 +1,252 @@
+from dataclasses import fields, replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view, register_view
+from tests.conftest import make_camera
+from tests.lerobot_symview.test_upsampling import plane_depth
+
+SIZE = 32
+CENTRE = (0.45, 0.0)
+
+
+def make_frame(camera=None, gripper=(0.0, 0.0, 0.2, 0.0, 1.0), seed=0):
+    """Random colours over a smooth random relief, as `camera` could measure it."""
+    camera = camera or make_camera(size=96)
+    rng = np.random.default_rng(seed)
+    shape = (camera.height, camera.width)
+    depth = 0.75 + 0.05 * np.sin(np.arange(shape[0])[:, None] / 7) + 0.02 * rng.random(shape)
+    rgb = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    return Frame(rgb, depth.astype(np.float32), camera, Workspace(), np.array(gripper))
+
+
+def turned(frame, quarter_turns):
+    """The same frame with camera and gripper turned about the workspace centre, which the world turned with."""
+    angle = quarter_turns * np.pi / 2
+    rotation = np.eye(4)
+    rotation[:2, :2] = np.rint([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    centre = np.array([*CENTRE, 0.0])
+    rotation[:3, 3] = centre - rotation[:3, :3] @ centre
+    gripper = frame.gripper.copy()
+    gripper[:2] = rotation[:2, :2] @ gripper[:2]
+    gripper[3] += angle
+    camera = Camera(frame.camera.intrinsics, rotation @ frame.camera.world_from_cam, *frame.rgb.shape[:2])
+    return Frame(frame.rgb, frame.depth, camera, frame.workspace, gripper)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_outputs_have_the_declared_kinds_and_size(name):
+    view = make_view(name, size=SIZE)
+    images = view.render(make_frame())
+    assert list(images) == list(view.outputs)
+    for output, kind in view.outputs.items():
+        assert images[output].shape == ((SIZE, SIZE, 3) if kind == "rgb" else (SIZE, SIZE))
+        assert images[output].dtype == (np.uint8 if kind == "rgb" else np.float32)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_is_a_pure_function(name):
+    frame = make_frame()
+    before = frame.rgb.copy(), frame.depth.copy()
+    first, second = (make_view(name, size=SIZE).render(frame) for _ in range(2))
+    for output in first:
+        np.testing.assert_array_equal(first[output], second[output])
+    np.testing.assert_array_equal(frame.rgb, before[0])
+    np.testing.assert_array_equal(frame.depth, before[1])
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2, 3])
+@pytest.mark.parametrize(("name", "options"), [("reproj", {"infill": "none"}), ("persp", {})])
+def test_turning_camera_and_gripper_turns_the_view(name, options, quarter_turns):
+    view = make_view(name, size=SIZE, **options)
+    frame = make_frame(gripper=(0.05, -0.08, 0.2, 0.3, 0.8))
+    for output, image in view.render(turned(frame, quarter_turns)).items():
+        expected = np.rot90(view.render(frame)[output], quarter_turns).astype(float)
+        # the warp interpolates in fixed point, so a grey level may differ; a point on a bin's edge may change bins
+        assert (np.abs(image.astype(float) - expected) > (3 if name == "persp" else 1e-6)).mean() < 0.01
+
+
+def test_reprojection_from_the_oracles_place_is_the_image_itself():
+    size = 40
+    camera = make_camera(90.0, size=size, fov=2 * np.rad2deg(np.arctan(0.2 / 0.81)))
+    frame = make_frame(camera)
+    flat = Frame(frame.rgb, np.full((size, size), 0.81, dtype=np.float32), camera, frame.workspace, frame.gripper)
+    images = make_view("reproj", size=size).render(flat)
+    np.testing.assert_array_equal(images["reproj"], frame.rgb)
+    np.testing.assert_allclose(images["reproj_height"], 0.0, atol=1e-6)
+
+
+def test_points_above_the_gripper_never_appear():
+    frame = make_frame(gripper=(0.0, 0.0, 0.1, 0.0, 1.0))
+    free = make_view("reproj", size=SIZE, clip="none").render(frame)["reproj_height"]
+    cut = make_view("reproj", size=SIZE).render(frame)["reproj_height"]
+    assert free.max() > 0.09
+    assert cut.max() <= 0.09 + 1e-6
+
+
+def test_what_the_gripper_touches_stays_visible():
+    frame = make_frame(gripper=(0.0, 0.0, 0.02, 0.0, 1.0))
+    assert 0.03 < make_view("reproj", size=SIZE).render(frame)["reproj_height"].max() <= 0.06 + 1e-6
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_invalid_depth_never_writes(bad):
+    frame = make_frame()
+    depth = np.full_like(frame.depth, bad)
+    images = make_view("reproj", size=SIZE).render(
+        Frame(frame.rgb, depth, frame.camera, frame.workspace, frame.gripper)
+    )
+    assert images["reproj"].max() == 0
+    assert images["reproj_height"].max() == 0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rgb": np.zeros((48, 96, 3), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(48, 96, 3\)"),
+        ({"rgb": np.zeros((96, 96, 4), np.uint8)}, r"rgb must be \(96, 96, 3\) uint8 .*got \(96, 96, 4\)"),
+        ({"rgb": np.zeros((96, 96, 3), np.float32)}, "rgb must be .*uint8.*float32"),
+        ({"depth": np.zeros((96, 48), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 48\)"),
+        ({"depth": np.zeros((96, 96, 1), np.float32)}, r"depth must be \(96, 96\) .*got \(96, 96, 1\)"),
+        ({"depth": np.zeros((96, 96), bool)}, "depth must be .*float or integer.*bool"),
+        ({"gripper": np.array([0.0, 0.0, np.nan, 0.0, 1.0])}, "gripper.*must be finite, got .*nan"),
+        ({"gripper": np.array([0.0, 0.0, 0.2, 0.0, np.inf])}, "gripper.*must be finite, got .*inf"),
+    ],
+)
+def test_what_no_camera_or_encoder_measures_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        replace(make_frame(), **wrong)
+
+
+def test_reprojection_without_depth_names_the_alternative():
+    frame = make_frame()
+    with pytest.raises(ValueError, match="persp"):
+        make_view("reproj").render(Frame(frame.rgb, None, frame.camera, frame.workspace, frame.gripper))
+
+
+def test_an_unknown_view_is_answered_with_the_nearest_known_one():
+    with pytest.raises(ValueError, match="did you mean 'reproj'"):
+        make_view("reprojj")
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("reproj", {"infill": "magic"}),
+        ("reproj", {"clip": "high"}),
+        ("reproj", {"size": 0}),
+        ("reproj", {"source_scale": 0}),
+        ("reproj", {"size": 76.5}),
+        ("reproj", {"clip": np.nan}),
+        ("reproj", {"clip": -np.inf}),
+        ("reproj", {"clip_margin": np.nan}),
+        ("reproj", {"clip_margin": np.inf}),
+        ("reproj", {"clip_floor": np.nan}),
+        ("reproj", {"clip_floor": -np.inf}),
+        ("reproj", {"source_scale": 1.5}),
+        ("reproj", {"source_scale": np.nan}),
+        ("persp", {"plane_height": "table"}),
+        ("persp", {"plane_height": np.nan}),
+        ("persp", {"plane_height": np.inf}),
+    ],
+)
+def test_impossible_options_are_refused(name, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        make_view(name, **options)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_every_combination_of_outputs_is_what_is_declared(name):
+    switches = [field.name for field in fields(VIEWS[name]) if isinstance(field.default, bool)]
+    for values in product([False, True], repeat=len(switches)):
+        view = make_view(name, size=SIZE, **dict(zip(switches, values, strict=True)))
+        assert list(view.render(make_frame())) == list(view.outputs)
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_a_view_that_needs_no_gripper_does_without(name):
+    options = {"reproj": {"clip": "none"}, "persp": {"gripper": False}}[name]
+    view = make_view(name, size=SIZE, **options)
+    assert not view.needs_gripper
+    view.render(replace(make_frame(), gripper=None))
+    assert make_view(name).needs_gripper
+    with pytest.raises(ValueError, match="gripper"):
+        make_view(name, size=SIZE).render(replace(make_frame(), gripper=None))
+
+
+def test_a_fixed_height_cuts_wherever_the_gripper_is():
+    for gripper_height in (0.02, 0.2):
+        frame = make_frame(gripper=(0.0, 0.0, gripper_height, 0.0, 1.0))
+        heights = make_view("reproj", size=SIZE, clip=0.03).render(frame)["reproj_height"]
+        assert 0.02 < heights.max() <= 0.03 + 1e-6
+
+
+def test_an_infinite_height_cuts_nothing():
+    frame = make_frame()
+    expected = make_view("reproj", size=SIZE, clip="none").render(frame)
+    for output, image in make_view("reproj", size=SIZE, clip=np.inf).render(frame).items():
+        np.testing.assert_array_equal(image, expected[output])
+
+
+def test_the_plane_follows_the_gripper_if_asked():
+    frame = make_frame(gripper=(0.0, 0.0, 0.07, 0.0, 1.0))
+    following = make_view("persp", size=SIZE, plane_height="gripper").render(frame)["persp"]
+    np.testing.assert_array_equal(
+        following, make_view("persp", size=SIZE, plane_height=float(frame.gripper[2])).render(frame)["persp"]
+    )
+    assert (following != make_view("persp", size=SIZE).render(frame)["persp"]).any()
+
+
+def table_frame(camera, dtype=np.float32):
+    """The bare table, each pixel of another colour."""
+    rgb = np.random.default_rng(0).integers(1, 256, (camera.height, camera.width, 3), dtype=np.uint8)
+    return Frame(rgb, plane_depth(camera).astype(dtype), camera, Workspace(), np.array([0.0, 0.0, 0.3, 0.0, 1.0]))
+
+
+def test_a_larger_source_leaves_no_gaps_in_a_surface():
+    frame = table_frame(make_camera(45.0))
+    shares = [
+        (make_view("reproj", source_scale=scale, mask=True).render(frame)["reproj_seen"] > 0).mean()
+        for scale in (1, 2, 4)
+    ]
+    assert shares[0] < 0.5  # at 45 degrees an image of the same size has fewer points than the view has pixels
+    assert shares[0] < shares[1] < shares[2]
+    assert shares[2] == 1.0
+
+
+@pytest.mark.parametrize("scale", [1, 3])
+def test_the_mask_tells_seen_from_inferred(scale):
+    frame = make_frame()
+    options = {"size": SIZE, "source_scale": scale, "mask": True}
+    bare = make_view("reproj", infill="none", **options).render(frame)
+    filled = make_view("reproj", **options).render(frame)
+    seen = filled["reproj_seen"][..., 0] > 0
+    np.testing.assert_array_equal(filled["reproj_seen"], bare["reproj_seen"])
+    np.testing.assert_array_equal(filled["reproj"][seen], bare["reproj"][seen])
+    assert not bare["reproj"][~seen].any()
+    assert set(np.unique(filled["reproj_seen"])) <= {0, 255}
+
+
+def test_millimetres_are_taken_as_such():
+    frame = table_frame(make_camera(60.0))
+    millimetres = replace(frame, depth=np.rint(frame.depth * 1000).astype(np.uint16))
+    in_metres = replace(frame, depth=np.rint(frame.depth * 1000).astype(np.float32) / np.float32(1000))
+    view = make_view("reproj", size=SIZE)
+    for output, image in view.render(millimetres).items():
+        np.testing.assert_array_equal(image, view.render(in_metres)[output])
+
+
+@pytest.mark.parametrize("infill", INFILLS)
+def test_a_frame_without_any_point_gives_black(infill):
+    frame = replace(make_frame(), depth=np.zeros((96, 96), np.float32))
+    images = make_view("reproj", size=SIZE, infill=infill, mask=True).render(frame)
+    assert not any(image.any() for image in images.values())
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(ValueError, match="already"):
+        register_view("reproj")(object)

@@ -1,0 +1,121 @@
+"""The same bits as the compiled kernels; on a GPU too, where there is one."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lerobot_symview.geometry.infill import nearest_known
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views import Frame, make_view
+from lerobot_symview.views.torch_backend import FrameBatch, can_batch, nearest_known_batch, render_batch
+from tests.conftest import make_camera
+from tests.lerobot_symview.cameras import SHAPE, cameras
+from tests.lerobot_symview.test_infill import MASKS
+from tests.lerobot_symview.test_zbuffer import random_depth
+
+SIZE = 24
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+OPTIONS = [
+    ("reproj", {"infill": "nearest", "mask": True}),
+    ("reproj", {"infill": "none", "clip": "none"}),
+    ("reproj", {"infill": "none", "clip": 0.05, "height": False}),
+    ("persp", {}),
+    ("persp", {"plane_height": "gripper", "gripper": False}),
+]
+
+
+def frames_of(views, seed):
+    """Two frames; heights come in steps, so that many are equal."""
+    rng = np.random.default_rng(seed)
+    for camera in views:
+        depth = random_depth(int(rng.integers(2**31))).astype(np.float32)
+        depth[::2] = np.round(depth[::2], 1)
+        gripper = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.0, 0.1), rng.uniform(-2, 2), rng.random()])
+        rgb = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
+        yield Frame(rgb, depth, camera, Workspace(), gripper.astype(np.float32))
+
+
+def batch_of(frames, device):
+    return FrameBatch(
+        torch.from_numpy(np.stack([frame.rgb for frame in frames])).permute(0, 3, 1, 2).contiguous().to(device),
+        torch.from_numpy(np.stack([frame.depth for frame in frames])).to(device),
+        [frame.camera for frame in frames],
+        frames[0].workspace,
+        torch.from_numpy(np.stack([frame.gripper for frame in frames])).to(device),
+    )
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("name", "options"), OPTIONS)
+@given(views=st.lists(cameras(), min_size=2, max_size=2), seed=st.integers(0, 2**32 - 1))
+def test_a_batch_has_the_bits_of_its_frames(name, options, device, views, seed):
+    view, frames = make_view(name, size=SIZE, **options), list(frames_of(views, seed))
+    try:
+        expected = [view.render(frame) for frame in frames]
+    except ValueError:  # the camera lies behind or in the plane: the same is said of the batch
+        with pytest.raises(ValueError, match=r"workspace|plane"):
+            render_batch(view, batch_of(frames, device))
+        return
+    images = render_batch(view, batch_of(frames, device))
+    assert list(images) == list(view.outputs)
+    for output, stacked in images.items():
+        for one, image in zip(expected, stacked.cpu().numpy(), strict=True):
+            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, one[output])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@given(known=MASKS.filter(np.any))
+def test_nearest_pixels_are_those_found_one_by_one(device, known):
+    batch = torch.from_numpy(np.stack([known, np.zeros_like(known)])).to(device)
+    found = nearest_known_batch(batch).cpu().numpy()
+    np.testing.assert_array_equal(found[0], nearest_known(known))
+    assert not found[1].any()
+
+
+def colored_batch(**changes):
+    """Two small black frames without depth."""
+    images = {"rgb": torch.zeros(2, 3, 8, 8, dtype=torch.uint8), "depth": None}
+    return FrameBatch(**{**images, "cameras": [make_camera(size=8)] * 2, "workspace": Workspace(), **changes})
+
+
+@pytest.mark.parametrize("options", [{"infill": "local"}, {"source_scale": 2}])
+def test_what_is_not_batched_says_so(options):
+    view = make_view("reproj", **options)
+    assert not can_batch(view)
+    batch = colored_batch()
+    with pytest.raises(ValueError, match="frame by frame"):
+        render_batch(view, batch)
+
+
+def test_missing_inputs_are_named():
+    batch = colored_batch()
+    with pytest.raises(ValueError, match="needs depth"):
+        render_batch(make_view("reproj"), batch)
+    with pytest.raises(ValueError, match="gripper"):
+        render_batch(make_view("persp"), batch)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rgb": torch.zeros(2, 8, 8, 3, dtype=torch.uint8)}, r"rgb must be \(B, 3, H, W\) uint8, got \(2, 8, 8, 3\)"),
+        ({"rgb": torch.zeros(2, 3, 8, 8)}, "rgb must be .*uint8.*float32"),
+        ({"rgb": torch.zeros(2, 3, 6, 8, dtype=torch.uint8)}, r"rgb has 6 x 8 pixels, the cameras have \[\(8, 8\)\]"),
+        ({"cameras": [make_camera(size=8)]}, "2 frames need as many cameras, got 1"),
+        ({"cameras": [make_camera(size=8), make_camera(size=6)]}, r"8 x 8 pixels, .*\(6, 6\)"),
+        ({"depth": torch.zeros(2, 1, 8, 8)}, r"depth must be \(2, 8, 8\) .*got \(2, 1, 8, 8\)"),
+        ({"depth": torch.zeros(2, 8, 8, dtype=torch.int32)}, "depth must be .*float metres.*int32"),
+    ],
+)
+def test_images_that_are_not_the_cameras_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        colored_batch(**changes)
+
+
+@pytest.mark.parametrize("options", [{}, {"plane_height": "gripper"}])
+def test_a_gripper_that_is_nowhere_is_refused(options):
+    gripper = torch.tensor([[0.0, 0.0, 0.2, 0.0, 1.0], [0.0, 0.0, torch.nan, 0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"gripper.*must be finite, got .*nan"):
+        render_batch(make_view("persp", **options), colored_batch(gripper=gripper))
