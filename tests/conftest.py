@@ -2,11 +2,8 @@
 
 import atexit
 import os
-import resource
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 # Hugging Face's libraries and numba read these when they are imported, which happens below.
@@ -19,13 +16,11 @@ if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers share what the first 
     os.environ |= {"HF_HOME": f"{scratch}/huggingface", "NUMBA_CACHE_DIR": f"{scratch}/numba"}
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
 
-import numpy as np
 import pytest
 from hypothesis import settings
 
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import PushedDataset
-from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
@@ -88,24 +83,3 @@ def only_views(recorded: Path) -> Path:
 @pytest.fixture
 def workspace() -> Workspace:
     return Workspace()
-
-
-def make_camera(elevation: float = 45.0, azimuth: float = 0.0, size: int = 152, fov: float = 48.0) -> Camera:
-    """A camera that looks at the default workspace's centre from 0.81 m; angles in degrees."""
-    return Camera(
-        intrinsics_from_fov(np.deg2rad(fov), size, size),
-        orbit_pose(np.deg2rad(elevation), np.deg2rad(azimuth), 0.81, (0.45, 0.0, 0.0)),
-        size,
-        size,
-    )
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """Let every write beyond `size` bytes of a file fail, as on a full disk."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

@@ -12,8 +12,8 @@ from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import PushedDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
-from tests.lerobot_policy_symview.test_training import train
-from tests.packages import install
+from tests.helpers.packages import install
+from tests.helpers.training import train
 
 MODULE = """
     from dataclasses import dataclass

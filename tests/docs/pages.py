@@ -11,7 +11,7 @@ from pathlib import Path
 from accelerate.state import AcceleratorState
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from tests.packages import install
+from tests.helpers.packages import install
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))

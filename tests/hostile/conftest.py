@@ -5,8 +5,8 @@ import shutil
 import pytest
 
 from lerobot_policy_symview.processor_pipelines import make_processors
+from tests.helpers.policies import make_policy
 from tests.hostile.files import DATA
-from tests.lerobot_policy_symview.policies import make_policy
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.runtime.cli import DatasetTarget
 from symview_eval.preview import PreviewConfig, preview
-from tests.lerobot_symview.derived import views_config
+from tests.helpers.datasets import views_config
 
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 RGB, DEPTH = keys.rgb("side"), keys.depth("side")

@@ -19,7 +19,8 @@ from lerobot_symview.geometry.camera import CalibrationError
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
-from tests.conftest import make_camera
+from tests.helpers.cameras import make_camera
+from tests.helpers.policies import make_config
 from tests.hostile.files import (
     DATA,
     DEPTH,
@@ -37,7 +38,6 @@ from tests.hostile.files import (
     saved_replay,
     tiff_of,
 )
-from tests.lerobot_policy_symview.policies import make_config
 
 
 @both_commands

@@ -23,9 +23,9 @@ from lerobot_symview.runtime.cli import CommandError
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
+from tests.helpers.training import train
 from tests.hub.client import online
 from tests.hub.server import ALICE, BOB, HubServer
-from tests.lerobot_policy_symview.test_training import train
 
 STOCK = {  # as small as they go
     "act": ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32"]

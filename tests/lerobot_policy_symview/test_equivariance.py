@@ -20,7 +20,7 @@ from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post
 from lerobot_policy_symview.symmetry.representations import Motion
 from lerobot_symview import keys
 from symview_sim.env import SymviewEnv
-from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch
+from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
 BROKEN = [method for method in METHODS if method.endswith("_broken")]
 RELAXED = [method for method in METHODS if method.endswith("_relaxed")]

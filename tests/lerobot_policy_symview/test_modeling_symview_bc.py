@@ -14,7 +14,7 @@ from lerobot_policy_symview.nn.encoders.convolutional import ENCODERS
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
 from lerobot_symview.views import VIEWS, ReprojectedView
-from tests.lerobot_policy_symview.policies import make_config, make_policy, take_training_steps, training_batch
+from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
 
 def act(policy, observation, processors=None):

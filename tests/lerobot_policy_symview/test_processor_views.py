@@ -12,12 +12,13 @@ from lerobot_policy_symview.rl.rollouts import observed as simulated
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import CalibrationError, depth_in_metres, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import INFILLS, VIEWS, Frame, make_view
+from lerobot_symview.views import VIEWS, Frame, make_view
+from lerobot_symview.views.reprojection import INFILLS
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.settings import EnvSettings
 from tests.conftest import VIEW_SIZE
-from tests.lerobot_policy_symview.policies import make_config
+from tests.helpers.policies import make_config
 
 OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
 

@@ -1,39 +1,14 @@
 """LeRobot's own training command, in this process, for every method; and what it leaves, evaluated."""
 
-import sys
-
 import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
-from lerobot.scripts import lerobot_train
 
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from symview_sim.env import SymviewEnv
-
-
-def train(monkeypatch, dataset, output, *options):
-    """Run two steps; a later option wins over an earlier one."""
-    command = [
-        "lerobot-train",
-        "--dataset.repo_id=test/recorded",
-        f"--dataset.root={dataset}",
-        "--policy.type=symview_bc",
-        "--policy.width=16",
-        "--policy.crop_size=64",
-        "--policy.device=cpu",
-        "--policy.push_to_hub=false",
-        "--steps=2",
-        "--batch_size=2",
-        "--num_workers=0",
-        "--env_eval_freq=0",
-        f"--output_dir={output}",
-        *options,
-    ]
-    monkeypatch.setattr(sys, "argv", command)
-    lerobot_train.main()
-    return output / "checkpoints" / "last" / "pretrained_model"
+from tests.helpers.training import train
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -11,8 +11,8 @@ from lerobot_symview.runtime.cli import CommandError, DatasetTarget
 from lerobot_symview.views import make_view
 from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
 from symview_eval.preview import PreviewConfig, preview, read_moments, table_resolution
-from tests.conftest import make_camera
-from tests.lerobot_symview.derived import views_config
+from tests.helpers.cameras import make_camera
+from tests.helpers.datasets import views_config
 
 
 def config(source, folder, **options):

@@ -21,7 +21,8 @@ from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
-from tests.conftest import EPISODES, largest_file
+from tests.conftest import EPISODES
+from tests.helpers.files import largest_file
 
 pytestmark = pytest.mark.long
 

@@ -8,7 +8,7 @@ from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
-from tests.conftest import make_camera
+from tests.helpers.cameras import make_camera
 
 BOX = np.array([0.30, 0.24, 0.04])
 

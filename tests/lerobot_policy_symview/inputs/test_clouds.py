@@ -13,7 +13,7 @@ from lerobot_policy_symview.symmetry.representations import Motion
 from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.env import SymviewEnv
-from tests.conftest import make_camera
+from tests.helpers.cameras import make_camera
 
 WORKSPACE = Workspace()
 

@@ -14,7 +14,7 @@ from lerobot_policy_symview.rl.learner import MEASURES, Learner
 from lerobot_policy_symview.rl.replay import Sample
 from lerobot_policy_symview.symmetry.representations import Motion
 from lerobot_symview import keys
-from tests.lerobot_policy_symview.policies import make_actor, training_batch
+from tests.helpers.policies import make_actor, training_batch
 from tests.lerobot_policy_symview.test_equivariance import EQUIVARIANT
 
 pytestmark = pytest.mark.long

@@ -28,7 +28,7 @@ from lerobot_symview import keys
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.runtime.cli import CommandError
 from symview_sim.settings import EnvSettings, RecordedDataset
-from tests.lerobot_policy_symview.test_training import train
+from tests.helpers.training import train
 
 pytestmark = pytest.mark.long
 

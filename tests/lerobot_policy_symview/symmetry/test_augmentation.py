@@ -8,7 +8,7 @@ from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import Motion, Symmetry
 from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.workspace import Workspace
-from tests.lerobot_policy_symview.policies import make_policy
+from tests.helpers.policies import make_policy
 
 IMAGES = torch.rand(2, 3, 12, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 

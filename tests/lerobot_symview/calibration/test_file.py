@@ -8,7 +8,7 @@ from lerobot_symview.calibration.file import parse_calibration, plain_calibratio
 from lerobot_symview.geometry.camera import CalibrationError
 from lerobot_symview.geometry.workspace import Workspace, check_visible
 from lerobot_symview.runtime.cli import CommandError
-from tests.conftest import make_camera
+from tests.helpers.cameras import make_camera
 
 
 def content(**changes):

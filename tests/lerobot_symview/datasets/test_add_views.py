@@ -20,7 +20,7 @@ from lerobot_symview.views import VIEWS, Frame, make_view
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
-from tests.lerobot_symview.derived import contents, images_of, views_config
+from tests.helpers.datasets import contents, images_of, views_config
 
 
 def parquet_columns(folder):

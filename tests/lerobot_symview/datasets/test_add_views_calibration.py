@@ -31,8 +31,8 @@ from lerobot_symview.views import VIEWS, Frame, make_view
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
-from tests.lerobot_symview.derived import images_of, views_config
-from tests.lerobot_symview.test_upsampling import plane_depth
+from tests.helpers.cameras import plane_depth
+from tests.helpers.datasets import images_of, views_config
 
 NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 

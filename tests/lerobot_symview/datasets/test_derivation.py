@@ -19,8 +19,9 @@ from lerobot_symview.datasets import derivation
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.runtime.cli import CommandError
-from tests.conftest import VIEW_SIZE, largest_file
-from tests.lerobot_symview.derived import contents, views_config
+from tests.conftest import VIEW_SIZE
+from tests.helpers.datasets import contents, views_config
+from tests.helpers.files import largest_file
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ import cv2, datasets
 from lerobot_symview.datasets import add_views, derivation
 from lerobot_symview.datasets.hub import PushedDataset
 from lerobot_symview.views import *
-from tests.lerobot_symview.test_views import make_frame
+from tests.helpers.cameras import make_frame
 cv2.setNumThreads(0)  # threads do not survive a fork
 for name in VIEWS:  # compiled once
     make_view(name).render(make_frame())

@@ -11,7 +11,7 @@ from lerobot_symview.geometry.camera import (
     transform,
     unproject,
 )
-from tests.conftest import make_camera
+from tests.helpers.cameras import make_camera
 
 POSES = [(45, 0), (15, 90), (75, -130), (90, 0)]
 

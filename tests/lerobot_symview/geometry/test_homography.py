@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from lerobot_symview.geometry.camera import CalibrationError, Camera, project, stored_camera
 from lerobot_symview.geometry.homography import camera_direction, image_from_topdown, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
-from tests.conftest import make_camera
-from tests.lerobot_symview.cameras import cameras, moved, moved_picture, world_motion
+from tests.helpers.cameras import cameras, make_camera, moved, moved_picture, world_motion
 
 POSES = [(45, 0), (15, 60), (75, -100), (90, 0)]
 

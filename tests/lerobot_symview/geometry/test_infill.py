@@ -1,17 +1,10 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from scipy import ndimage
 
 from lerobot_symview.geometry.infill import fill_local, nearest_known
-
-MASKS = st.builds(
-    lambda seed, share, shape: np.random.default_rng(seed).random(shape) < share,
-    st.integers(0, 2**32 - 1),
-    st.floats(0.005, 0.9),
-    st.tuples(st.integers(1, 20), st.integers(1, 20)),
-)
+from tests.helpers.cameras import MASKS
 
 
 def slow_nearest(known):

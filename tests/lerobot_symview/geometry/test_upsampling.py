@@ -4,18 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_symview.geometry.upsampling import MAX_STEP, enlarge_depth
-from tests.conftest import make_camera
-from tests.lerobot_symview.cameras import cameras
-
-
-def plane_depth(camera, height=0.0):
-    """Depth of the plane at `height` seen by `camera`, 0 where it does not see it."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.intrinsics).T
-    downwards = (rays @ camera.world_from_cam[:3, :3].T)[..., 2]
-    with np.errstate(divide="ignore"):
-        depth = (height - camera.position[2]) / downwards
-    return np.where((downwards < 0) & (depth < 100), depth, 0.0)
+from tests.helpers.cameras import cameras, make_camera, plane_depth
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 5])

@@ -6,20 +6,10 @@ from hypothesis import strategies as st
 from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.geometry.zbuffer import EMPTY, gather, zbuffer_from_depth, zbuffer_from_points
-from tests.conftest import make_camera
-from tests.lerobot_symview.cameras import SHAPE, cameras, moved, moved_picture
+from tests.helpers.cameras import cameras, make_camera, moved, moved_picture, random_depth
 
 SIZE = 24
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def random_depth(seed, shape=SHAPE):
-    """Depths of 0.3 to 1.7 m without equals, a tenth of them invalid in every way there is."""
-    rng = np.random.default_rng(seed)
-    depth = rng.uniform(0.3, 1.7, shape)
-    invalid = rng.random(shape) < 0.1
-    depth[invalid] = rng.choice([0.0, -1.0, np.nan, np.inf, -np.inf], invalid.sum())
-    return depth
 
 
 def slow_zbuffer(points, workspace, pixels, ceiling=np.inf):

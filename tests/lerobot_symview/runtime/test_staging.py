@@ -8,7 +8,7 @@ import pytest
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.runtime.staging import DONE, REQUEST, is_complete, open_partial, remove_partial
-from tests.lerobot_symview.derived import contents, views_config
+from tests.helpers.datasets import contents, views_config
 
 DESCRIPTION = {"source": "test/recorded", "size": 76}
 

@@ -10,10 +10,7 @@ from lerobot_symview.geometry.infill import nearest_known
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, make_view
 from lerobot_symview.views.torch_backend import FrameBatch, can_batch, nearest_known_batch, render_batch
-from tests.conftest import make_camera
-from tests.lerobot_symview.cameras import SHAPE, cameras
-from tests.lerobot_symview.test_infill import MASKS
-from tests.lerobot_symview.test_zbuffer import random_depth
+from tests.helpers.cameras import MASKS, SHAPE, cameras, make_camera, random_depth
 
 SIZE = 24
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

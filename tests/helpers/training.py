@@ -1,0 +1,28 @@
+"""LeRobot's training command, in process."""
+
+import sys
+
+from lerobot.scripts import lerobot_train
+
+
+def train(monkeypatch, dataset, output, *options):
+    """Run two steps; a later option wins over an earlier one."""
+    command = [
+        "lerobot-train",
+        "--dataset.repo_id=test/recorded",
+        f"--dataset.root={dataset}",
+        "--policy.type=symview_bc",
+        "--policy.width=16",
+        "--policy.crop_size=64",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--steps=2",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--env_eval_freq=0",
+        f"--output_dir={output}",
+        *options,
+    ]
+    monkeypatch.setattr(sys, "argv", command)
+    lerobot_train.main()
+    return output / "checkpoints" / "last" / "pretrained_model"
