@@ -7,6 +7,7 @@ import pytest
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import VIEWS, Frame, make_view, register_view
+from lerobot_symview.views.reprojection import INFILLS
 from tests.helpers.cameras import make_camera, make_frame, plane_depth
 
 SIZE = 32
@@ -229,7 +230,7 @@ def test_millimetres_are_taken_as_such():
         np.testing.assert_array_equal(image, view.render(in_metres)[output])
 
 
-@pytest.mark.parametrize("infill")
+@pytest.mark.parametrize("infill", INFILLS)
 def test_a_frame_without_any_point_gives_black(infill):
     frame = replace(make_frame(), depth=np.zeros((96, 96), np.float32))
     images = make_view("reproj", size=SIZE, infill=infill, mask=True).render(frame)
