@@ -15,7 +15,7 @@ from torchvision.utils import save_image
 
 from lerobot_symview import PerspectiveView, ReprojectedView, Workspace, keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
@@ -28,7 +28,7 @@ def main(dataset: Path | None, size: int, output_dir: Path) -> None:
         recorded = NewDataset("me/picking", output_dir / "picking")
         dataset = generate(GenerateConfig(recorded, num_episodes=2, resume=True))
     config = AddViewsConfig(
-        PushedDataset("me/picking", dataset),
+        HubDataset("me/picking", dataset),
         new_root=output_dir / "picking_views",
         views=["reproj", "persp"],
         size=size,

@@ -14,7 +14,7 @@ from lerobot.datasets import LeRobotDataset, remove_feature
 from lerobot_symview import CameraSpec, PerspectiveView, ReprojectedView, keys
 from lerobot_symview.calibration.file import read_calibration
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 
@@ -34,7 +34,7 @@ def record_stand_in(calibration: Path, output_dir: Path) -> Path:
 def main(dataset: Path | None, calibration: Path, output_dir: Path) -> None:
     """Add the views."""
     config = AddViewsConfig(
-        PushedDataset("me/real", dataset or record_stand_in(calibration, output_dir)),
+        HubDataset("me/real", dataset or record_stand_in(calibration, output_dir)),
         new_root=output_dir / "real_views",
         views=["reproj", "persp"],
         camera="front",

@@ -26,7 +26,7 @@ def make_policy(actions: dict[str, str], width: int) -> SymviewBcPolicy:
     """Return an untrained policy for a dataset of this robot."""
     declared: dict[str, Any] = {"state_symmetry": list(STATE.values()), "action_symmetry": list(actions.values())}
     # `vector` gives the network the state's numbers; the default draws a gripper whose yaw this state does not tell.
-    declared |= {"gripper_input": "vector", "view_options": {"clip": "none"}}  # nor can a view be clipped by its pose
+    declared |= {"gripper_input": "vector"}
     config = SymviewBcConfig(device="cpu", camera="front", width=width, crop_size=64, **declared)
     features = {
         "observation.images.front": {"dtype": "image", "shape": (480, 640, 3)},

@@ -17,7 +17,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import Frame, keys, make_view, register_view
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
@@ -32,7 +32,7 @@ class ReliefView:
     size: int = 152
     highest: float = 0.1
     outputs: ClassVar = {"relief": "rgb"}
-    needs_depth = needs_gripper = True
+    needs_depth = uses_gripper = True
 
     def render(self, frame: Frame) -> dict[str, np.ndarray]:
         """Return the picture, (size, size, 3) uint8."""
@@ -45,7 +45,7 @@ def main(size: int, output_dir: Path) -> None:
     """Record a demonstration and add the view by its name."""
     folder = generate(GenerateConfig(NewDataset("me/picking", output_dir / "picking"), num_episodes=1, resume=True))
     options = {"new_root": output_dir / "relief", "views": ["relief"], "size": size, "resume": True}
-    folder = add_views(AddViewsConfig(PushedDataset("me/picking", folder), **options))
+    folder = add_views(AddViewsConfig(HubDataset("me/picking", folder), **options))
     seen, key = LeRobotDataset("me/picking_views", root=folder), keys.view("side", "relief")
     made_with = seen.meta.features[key]["info"]["symview"]["options"]  # enough to make it again on a robot
     logger.info("%d images %s by %s", len(seen), tuple(seen[0][key].shape), make_view("relief", **made_with))

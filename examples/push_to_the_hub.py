@@ -13,7 +13,7 @@ from pathlib import Path
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
@@ -29,7 +29,7 @@ def main(repo_id: str, episodes: int, output_dir: Path) -> None:
     pulled = LeRobotDataset(repo_id)
     logger.info("pulled %d episodes of %s", pulled.num_episodes, repo_id)
 
-    source = PushedDataset(repo_id, pulled.root, **options)
+    source = HubDataset(repo_id, pulled.root, **options)
     add_views(AddViewsConfig(source, new_root=output_dir / "views", size=76, keep=[], resume=True))
     pulled = LeRobotDataset(f"{repo_id}_views")
     logger.info("pulled %s of %s_views", ", ".join(pulled.meta.camera_keys), repo_id)

@@ -22,7 +22,7 @@ from lerobot.scripts.lerobot_train import train
 from lerobot_policy_symview import SymviewEnvConfig
 from lerobot_symview import ReprojectedView
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
@@ -33,7 +33,7 @@ VIEW = ReprojectedView(size=96, height=False, source_scale=2)
 def main(demonstrations: int, steps: int, episodes: int, output_dir: Path) -> None:
     """Record, add the view, train and evaluate."""
     recorded = NewDataset("me/picking", output_dir / "picking")
-    source = PushedDataset("me/picking", generate(GenerateConfig(recorded, num_episodes=demonstrations, resume=True)))
+    source = HubDataset("me/picking", generate(GenerateConfig(recorded, num_episodes=demonstrations, resume=True)))
     seen = add_views(AddViewsConfig(source, new_root=output_dir / "views", reproj=VIEW, keep=[], resume=True))
 
     act = ACTConfig(device="cpu", dim_model=128, n_heads=4, dim_feedforward=256, chunk_size=8, n_action_steps=4)

@@ -17,7 +17,7 @@ from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, observed
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.simulators import Simulators
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 def demonstrate(folder: Path) -> Path:
     """Record demonstrations, make the view that the policy sees, and return the folder of that."""
     recorded = generate(GenerateConfig(NewDataset("me/picking", folder / "picking"), num_episodes=20, resume=True))
-    source = PushedDataset("me/picking", recorded)
+    source = HubDataset("me/picking", recorded)
     return add_views(AddViewsConfig(source, new_root=folder / "views", size=76, keep=[], resume=True))
 
 

@@ -19,7 +19,7 @@ from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.rollouts import Actor, evaluate, observed
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.simulators import Simulators
@@ -36,7 +36,7 @@ def as_if_open(observation: dict) -> dict:
 def main(steps: int, episodes: int, demonstrations: int, noise: float, seed: int, output_dir: Path) -> None:
     """Record, train, and evaluate every checkpoint twice, in the same scenes."""
     picking = NewDataset("me/picking", output_dir / "picking")
-    source = PushedDataset("me/picking", generate(GenerateConfig(picking, num_episodes=demonstrations, resume=True)))
+    source = HubDataset("me/picking", generate(GenerateConfig(picking, num_episodes=demonstrations, resume=True)))
     seen = add_views(AddViewsConfig(source, new_root=output_dir / "views", size=76, keep=[], resume=True))
     policy = SymviewBcConfig(device="cpu", width=16, crop_size=64, aperture_noise=noise, push_to_hub=False)
     options = {"save_freq": max(steps // 12, 1), "env_eval_freq": 0, "log_freq": 100, "seed": seed, "num_workers": 0}

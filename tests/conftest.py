@@ -20,7 +20,7 @@ import pytest
 from hypothesis import settings
 
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
@@ -57,7 +57,7 @@ def with_views(recorded: Path) -> Path:
     """Folder of the same dataset with both views added."""
     target = recorded.with_name("with_views")
     config = AddViewsConfig(
-        PushedDataset("test/recorded", recorded),
+        HubDataset("test/recorded", recorded),
         new_repo_id="test/with_views",
         new_root=target,
         views=["reproj", "persp"],
@@ -71,7 +71,7 @@ def only_views(recorded: Path) -> Path:
     """Folder of the same dataset with the reprojected view in place of the cameras' images."""
     target = recorded.with_name("only_views")
     config = AddViewsConfig(
-        PushedDataset("test/recorded", recorded),
+        HubDataset("test/recorded", recorded),
         new_repo_id="test/only_views",
         new_root=target,
         size=VIEW_SIZE,

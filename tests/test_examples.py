@@ -8,7 +8,6 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -115,9 +114,10 @@ def without_trace():
     """Forget the names that an example registers, and what it and LeRobot's training make of the root logger."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
-    with mock.patch.dict(VIEWS):
-        yield
-    registry.added.cache_clear()
+    yield
+    for name in set(VIEWS) - set(VIEWS.builtin) - set(registry.installed(VIEWS.group)):
+        VIEWS.unregister(name)
+    registry.installed.cache_clear()
     root.handlers[:], root.level = handlers, level
 
 

@@ -9,7 +9,7 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_symview import registry
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.helpers.packages import install
@@ -22,6 +22,7 @@ MODULE = """
     import torch
 
     from lerobot_policy_symview.nn.encoders.base import Encoder
+    from lerobot_symview import View
     from symview_sim.tasks.block_picking import BlockPicking
 
 
@@ -34,10 +35,9 @@ MODULE = """
 
 
     @dataclass(frozen=True)
-    class GreyView:
+    class GreyView(View):
         size: int = 76
         outputs = {"grey": "rgb"}
-        needs_depth = needs_gripper = False
 
         def render(self, frame):
             grey = cv2.cvtColor(cv2.resize(frame.rgb, (self.size, self.size)), cv2.COLOR_RGB2GRAY)
@@ -67,7 +67,7 @@ def other_package(tmp_path, monkeypatch):
     install(site, "other_package", ENTRY_POINTS, monkeypatch)
     (site / "other_package.py").write_text(dedent(MODULE))
     yield
-    registry.added.cache_clear()
+    registry.installed.cache_clear()
     sys.modules.pop("other_package", None)
 
 
@@ -76,7 +76,7 @@ def test_another_packages_task_view_and_encoder_go_all_the_way(tmp_path, monkeyp
     recorded, seen = tmp_path / "recorded", tmp_path / "seen"
     env = RecordedEnv(task="easy_picking", oracle=False)
     generate(GenerateConfig(NewDataset("test/recorded", recorded), env=env, num_episodes=2, num_workers=2))
-    source = PushedDataset("test/recorded", recorded)
+    source = HubDataset("test/recorded", recorded)
     add_views(AddViewsConfig(source, new_repo_id="test/seen", new_root=seen, views=["grey"], num_workers=2))
     options = ("--policy.view=grey", "--policy.modality=rgb", "--policy.gripper_input=none", "--policy.encoder=mean")
     checkpoint = train(monkeypatch, seen, tmp_path / "policy", *options)

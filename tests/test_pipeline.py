@@ -119,10 +119,10 @@ def test_lerobots_commands_list_our_options(command, options, monkeypatch, capsy
             2,
             "elevation_deg must lie in (0, 90]",
         ),
-        (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "there is no dataset in"),
+        (("symview-add-views", "--dataset.repo_id=no/where", "--views=[reproj]"), 1, "there is no LeRobot dataset in"),
         (("symview-add-views", "--dataset.repo_id=a/b", "--views=[reprojj]"), 2, "did you mean 'reproj'"),
         (("symview-add-views", "--dataset.repo_id=a/b", "--workspace.size=-1"), 2, "must be positive metres, got -1"),
-        (("symview-preview", "--dataset.repo_id=no/where"), 1, "there is no dataset in"),
+        (("symview-preview", "--dataset.repo_id=no/where"), 1, "there is no LeRobot dataset in"),
         (("symview-demo", "--steps=0"), 2, "--steps must be at least 1, got 0"),
     ],
 )

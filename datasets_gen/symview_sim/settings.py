@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from lerobot_symview.datasets.hub import HubOptions
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
-from lerobot_symview.runtime.cli import DatasetTarget
+from lerobot_symview.runtime.cli import DatasetLocation
 from symview_sim.robots import ROBOTS
 from symview_sim.tasks import check_task
 
@@ -64,7 +64,7 @@ class EnvSettings:
 
 
 @dataclass(frozen=True)
-class RecordedDataset(DatasetTarget):
+class RecordedDataset(DatasetLocation):
     """Where demonstrations are."""
 
     repo_id: str = "symview/demonstrations"

@@ -27,7 +27,7 @@ from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.camera import stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
-from lerobot_symview.views import Frame, View, make_view
+from lerobot_symview.views import Frame, View, ViewSpec
 from symview_sim.env import Observation as RawObservation
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
@@ -46,8 +46,8 @@ class Observed:
     """The environment."""
     names: tuple[str, ...]
     """Features to report."""
-    views: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Name -> options of the views to make."""
+    views: tuple[ViewSpec, ...] = ()
+    """Views to make."""
     camera: str = "side"
     """The camera they are made from."""
     workspace: dict[str, Any] = field(default_factory=dict)
@@ -187,7 +187,7 @@ def _simulate(connection: Connection, observed: Observed) -> None:
     """Carry out commands until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that trains, which ends this one
     env = observed.env.make()
-    views = [make_view(name, **options) for name, options in observed.views.items()]
+    views = [spec.make() for spec in observed.views]
     workspace = parse_workspace(observed.workspace)
 
     def report(raw: RawObservation) -> Observation:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import read_calibration
-from lerobot_symview.datasets.features import Features, stored_workspace
+from lerobot_symview.datasets.add_views import calibration_and_workspace, views_for_dataset
+from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
 from lerobot_symview.geometry.camera import Camera, project
 from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget, run_command
-from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, choose_views
+from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
+from lerobot_symview.runtime.view_flags import views_from_flags
+from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_eval.contact_sheet import Row, grey, montage, page, with_outline
 from symview_eval.rerun_recording import RerunRecording
 
@@ -41,7 +42,7 @@ class PreviewConfig:
     with many holes, and a camera too coarse for them.
     """
 
-    dataset: DatasetTarget
+    dataset: DatasetLocation
     """The dataset."""
     episodes: list[int] = field(default_factory=lambda: [0])
     """Which episodes."""
@@ -49,7 +50,7 @@ class PreviewConfig:
     """How many moments of each, evenly spaced."""
     camera: str = "side"
     """Camera that views are made from; a dataset that holds only views is shown as it is."""
-    views: list[str] | None = None
+    views: list[ViewSpec] | None = None
     """Which views to compute; by default those that the dataset does not store and has the images for, and those whose
     options are stated. Stored ones are shown as they are.
     """
@@ -123,7 +124,8 @@ class Measures:
 
 def preview(config: PreviewConfig) -> Path:
     """Write the files that `config` describes and return their folder."""
-    source = SourceDataset(config.dataset.folder())
+    with flagged("--dataset"):
+        source = SourceDataset(config.dataset.folder())
     total = len(source.episodes)
     unknown = [episode for episode in config.episodes if not 0 <= episode < total]
     if unknown:
@@ -161,22 +163,24 @@ def preview(config: PreviewConfig) -> Path:
 
 
 def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader | None, dict[str, View]]:
-    """Return what reads the camera's frames, None for a dataset of views alone, and the views to make."""
+    """Return the reader of the camera's frames, None for a dataset of views alone, and the views to make."""
     if keys.rgb(config.camera) not in source.features:
         if config.views is None and config.calibration is None:
             return None, {}
         raise ValueError(f"the dataset has no camera {config.camera!r}: check --camera")
-    calibration = read_calibration(config.calibration) if config.calibration else None
+    calibration, workspace = calibration_and_workspace(config.calibration, config.workspace, source.features)
     options: dict[str, View] = {"reproj": config.reproj, "persp": config.persp}
-    names = config.views or [name for name, view in options.items() if _is_wanted(config, view, source.features)]
-    views = choose_views(names, config.size, options) if names else {}
-    in_file = calibration.workspace if calibration is not None else None
-    workspace = config.workspace or in_file or stored_workspace(source.features)
+    specs = config.views
+    if specs is None:
+        specs = [ViewSpec(name) for name, view in options.items() if _is_wanted(config, view, source.features)]
+    views = views_from_flags(specs, config.size, options) if specs else {}
+    views = views_for_dataset(views, source.features)
     read_for = [*views.values()]
     if config.rerun and is_depth_feature(source.features.get(keys.depth(config.camera), {})):
         read_for.append(ReprojectedView(clip="none"))  # a recording has the point cloud even if no view needs it
     reader = FrameReader(source, config.camera, workspace, read_for, calibration)
-    reader.check()
+    with flagged(f"--camera={config.camera}, --calibration"):
+        reader.check()
     return reader, views
 
 
@@ -199,8 +203,7 @@ def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDAr
     """Return every output of the views, and the mask of those that have one, by name."""
     images: dict[str, NDArray] = {}
     for view in views.values():
-        has_mask = any(option.name == "mask" for option in fields(view))
-        images |= (replace(view, mask=True) if has_mask else view).render(frame)
+        images |= view.with_mask().render(frame)
     return {f"{camera}_{output}": image for output, image in images.items()}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.geometry.camera import depth_in_metres, unproject
+from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame
@@ -57,7 +57,7 @@ class RerunRecording:
         )
         log(f"world/{camera}/image", pinhole, rerun.Image(frame.rgb))
         if frame.depth is not None:
-            depth = depth_in_metres(frame.depth)
+            depth = frame.depth
             seen = np.isfinite(depth) & (depth > 0)
             points = unproject(np.where(seen, depth, 0.0), frame.camera)[seen]
             log("world/points", rerun.Points3D(points, colors=frame.rgb[seen], radii=POINT_RADIUS))

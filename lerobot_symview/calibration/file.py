@@ -29,9 +29,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_symview.geometry.camera import Array, CalibrationError, Camera
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.cli import CommandError
 
 METRES = {"m": 1.0, "mm": 0.001}
 CAMERA_ENTRIES = ("height", "width", "intrinsics", "world_from_cam")
@@ -55,26 +55,26 @@ class Calibration:
         return self.cameras[name]
 
 
-def read_calibration(file: Path) -> Calibration:
+def read_calibration(file: Path | str) -> Calibration:
     """Read the file that is described at the top of this module.
 
     Raises:
-        CommandError: if it cannot be read as YAML or JSON.
-        CalibrationError: all that is wrong with it, in one message.
+        CalibrationError: if it cannot be read as YAML or JSON, or everything that is wrong with its content, in one
+            message.
     """
     import yaml
 
     try:
-        text = file.read_text()
+        text = Path(file).read_text()
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise CommandError(f"--calibration={file} has an alias (*name): write out what it stands for")
+            raise CalibrationError(f"{file} has an alias (*name): write out what it refers to")
         content = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise CommandError(f"cannot read --calibration={file}: {error}") from None
+        raise CalibrationError(f"cannot read {file}: {error}") from None
     try:
         return parse_calibration(content)
     except CalibrationError as error:
-        raise CalibrationError(f"--calibration={file}: {error}") from None
+        raise CalibrationError(f"{file}: {error}") from None
 
 
 def parse_calibration(content: Any) -> Calibration:

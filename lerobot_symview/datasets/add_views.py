@@ -1,9 +1,9 @@
-"""`symview-add-views`: writes a dataset again with views as new camera keys."""
+"""`symview-add-views`: adds top-down views to a dataset as new camera keys."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import plain_calibration, read_calibration
+from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
 from lerobot_symview.datasets.derivation import (
     MADE_FROM,
     Derivation,
@@ -23,14 +23,15 @@ from lerobot_symview.datasets.derivation import (
     write_part,
 )
 from lerobot_symview.datasets.features import Features, calibration_features, stored_workspace, view_features
-from lerobot_symview.datasets.hub import PushedDataset, push_dataset
-from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset
-from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.datasets.hub import HubDataset, push_dataset
+from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, gripper_dimensions
+from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.workspace import Workspace, check_visible
-from lerobot_symview.runtime.cli import DatasetTarget, check_repo_id, run_command
+from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, plain, remove_partial
-from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
+from lerobot_symview.runtime.view_flags import views_from_flags
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 
 logger = logging.getLogger(__name__)
 
@@ -45,22 +46,20 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class AddViewsConfig:
-    """Write a dataset again with views from above as new camera keys. The source is not modified."""
+    """Add top-down views to a dataset as new camera keys. The result is a new dataset; the source is not modified."""
 
-    dataset: PushedDataset
-    """The source: it must hold the camera's images, and its calibration unless `calibration` states it. What is said of
-    the Hub is of the result.
-    """
+    dataset: HubDataset
+    """The source dataset, with the camera's images and calibration; the Hub options apply to the result."""
     new_repo_id: str = ""
-    """Name of the result; by default that of the source with `_views` appended."""
+    """Name of the result; by default the source's with `_views` appended."""
     new_root: Path | None = None
-    """Folder of the result; by default LeRobot's own cache folder for `new_repo_id`."""
-    views: list[str] = field(default_factory=lambda: ["reproj"])
-    """Which views to add: reproj (needs depth), persp."""
+    """Folder of the result; by default LeRobot's cache folder for `new_repo_id`."""
+    views: list[ViewSpec] = field(default_factory=lambda: [ViewSpec("reproj")])
+    """Views to add, by name or with options: `[reproj, {name: persp, plane_height: 0.025}]`. reproj needs depth."""
     camera: str = "side"
-    """Camera they are made from."""
+    """Camera whose images are used."""
     size: int | None = None
-    """Rows and columns of all views, in place of each one's own."""
+    """Rows and columns of the views that do not have a size of their own in `views`."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
@@ -68,45 +67,53 @@ class AddViewsConfig:
     calibration: Path | None = None
     """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
     workspace: Workspace | None = None
-    """What the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by default what
-    `calibration` says, else the dataset, else the simulator's. The gripper's x and y count from its centre.
-    """
+    """Square on the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
+    default the calibration file's, else the dataset's, else the simulator's. The gripper's x and y are relative to its
+    centre."""
     keep: list[str] | None = None
-    """Source image keys to keep, without `observation.images.`; by default all. `[]` leaves the views alone."""
+    """Source image keys to keep, without `observation.images.`; by default all. `[]` keeps none."""
     for_stock_policies: bool = False
-    """Only what LeRobot's own policies take: no source image, unless `keep` names it, and no height, which has one
-    channel.
-    """
+    """Write only what LeRobot's own policies accept: no source image, unless `keep` names it, and no height map, which
+    has one channel."""
     num_workers: int = 1
-    """Processes that make views side by side. The data does not depend on it."""
+    """Processes that render views in parallel. The data does not depend on their number."""
     resume: bool = False
-    """Go on where an earlier run of the same command was interrupted."""
+    """Continue an interrupted run of the same command."""
 
     def __post_init__(self) -> None:
         if self.num_workers < 1:
             raise ValueError(f"--num_workers must be at least 1, got {self.num_workers}")
         if self.new_repo_id:
             check_repo_id(self.new_repo_id, "--new_repo_id")
-        self.chosen_views()
+        self.make_views()
 
-    def chosen_views(self) -> dict[str, View]:
-        """Return the views by name."""
-        views = choose_views(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
-        return {name: _in_color(name, view) for name, view in views.items()} if self.for_stock_policies else views
+    def make_views(self) -> dict[str, View]:
+        """Return the views by name.
+
+        Raises:
+            ValueError: if a view or an option is unknown, or a view has no colour image for stock policies.
+        """
+        views = views_from_flags(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
+        if not self.for_stock_policies:
+            return views
+        try:
+            return {name: view.in_color() for name, view in views.items()}
+        except ValueError as error:
+            raise ValueError(f"--for_stock_policies=true takes images of three channels: {error}") from None
 
     def kept_images(self) -> list[str] | None:
         """Return the names of the source's images that are kept; None if all are."""
         return [] if self.keep is None and self.for_stock_policies else self.keep
 
-    def target(self) -> DatasetTarget:
-        """Return where the result goes."""
-        return DatasetTarget(self.new_repo_id or f"{self.dataset.repo_id}_views", self.new_root)
+    def target(self) -> DatasetLocation:
+        """Return the location of the result."""
+        return DatasetLocation(self.new_repo_id or f"{self.dataset.repo_id}_views", self.new_root)
 
 
 def add_views(config: AddViewsConfig) -> Path:
-    """Write the dataset that `config` describes, upload it if asked, and return its folder.
+    """Write the dataset that `config` describes, upload it if asked to, and return its folder.
 
-    Every frame's views are computed from its own calibration, so a camera may move. Original columns are copied bit for
+    Each frame's views are rendered with its own calibration, so a camera may move. Original columns are copied bit for
     bit and videos as files; statistics cover the new keys.
     """
     folder = _write(config)
@@ -116,7 +123,9 @@ def add_views(config: AddViewsConfig) -> Path:
 
 
 def _write(config: AddViewsConfig) -> Path:
-    source, target = SourceDataset(config.dataset.folder()), config.target().folder()
+    with flagged("--dataset"):
+        source = SourceDataset(config.dataset.folder())
+    target = config.target().folder()
     _check_apart(source.folder, target)
     with EXECUTORS["local"](config.num_workers, "lerobot_symview.datasets.derivation") as executor:
         derivation = _plan(config, source, partial_folder(target))
@@ -138,7 +147,7 @@ def _write(config: AddViewsConfig) -> Path:
 
 
 def _check_apart(source: Path, target: Path) -> None:
-    """Raise a ValueError if what is written would lie in what is read, or the other way round."""
+    """Raise a ValueError if the result would lie in the source, or the source in the result."""
     source = source.resolve()
     for written in (target.resolve(), partial_folder(target).resolve()):
         if written.is_relative_to(source) or source.is_relative_to(written):
@@ -149,19 +158,16 @@ def _check_apart(source: Path, target: Path) -> None:
 
 
 def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:
-    calibration = read_calibration(config.calibration) if config.calibration else None
-    in_file = calibration.workspace if calibration is not None else None
-    workspace = config.workspace or in_file or stored_workspace(source.features)
-    views = config.chosen_views()
+    calibration, workspace = calibration_and_workspace(config.calibration, config.workspace, source.features)
+    views = views_for_dataset(config.make_views(), source.features)
     added: Features = {}
     if calibration is not None:
-        check_visible(
-            config.camera, calibration.camera(config.camera), workspace, f"check the poses in {config.calibration}"
-        )
+        with flagged(f"--calibration={config.calibration}"):
+            check_visible(config.camera, calibration.camera(config.camera), workspace, "check the poses in the file")
         added |= calibration_features(config.camera)
-    stated = plain_calibration(calibration) if calibration is not None else None
+    stored_calibration = plain_calibration(calibration) if calibration is not None else None
     for name, view in views.items():
-        added |= view_features(config.camera, name, view, workspace, stated)
+        added |= view_features(config.camera, name, view, workspace, stored_calibration)
     kept = config.kept_images()
     dropped = [
         key
@@ -169,7 +175,8 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.rgb("")) not in kept
     ]
     reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
-    reader.check()
+    with flagged(f"--camera={config.camera}, --calibration"):
+        reader.check()
     _check_names(config, source.features, added)
     source.check_files([key for key in source.features if key not in dropped or key in reader.features()])
     return Derivation(
@@ -186,6 +193,31 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     )
 
 
+def calibration_and_workspace(
+    file: Path | None, workspace: Workspace | None, features: Features
+) -> tuple[Calibration | None, Workspace]:
+    """Return what `--calibration` and `--workspace` give: the file's content, and the flag's, file's or dataset's."""
+    if file is None:
+        return None, workspace or stored_workspace(features)
+    with flagged("--calibration"):
+        calibration = read_calibration(file)
+    return calibration, workspace or calibration.workspace or stored_workspace(features)
+
+
+def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, View]:
+    """Return the views as they are made for a dataset: without the gripper where its state is not recorded."""
+    using = [name for name, view in views.items() if view.uses_gripper]
+    if not using or gripper_dimensions(features) is not None:
+        return views
+    logger.warning(
+        "%s has no dimensions named %s: %s are made without clipping at the gripper and without a gripper image",
+        keys.STATE,
+        ", ".join(keys.STATE_NAMES),
+        ", ".join(using),
+    )
+    return {name: view.without_gripper() for name, view in views.items()}
+
+
 def _check_names(config: AddViewsConfig, features: Features, added: Features) -> None:
     existing = [key for key in added if key in features]
     if existing:
@@ -198,7 +230,7 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
 
 
 def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
-    """Make the views once, so that what is wrong with all frames is said before anything is written."""
+    """Render the first frame, so that an error of every frame is reported before anything is written."""
     reader = derivation.reader(source)
     frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
     for view in derivation.views.values():
@@ -206,7 +238,7 @@ def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
     if derivation.calibration is None:
         try:
             check_visible(
-                derivation.camera, frame.camera, derivation.workspace, "views will be empty where it sees none"
+                derivation.camera, frame.camera, derivation.workspace, "views will be empty where it sees nothing"
             )
         except CalibrationError as error:
             logger.warning("%s", error)
@@ -227,23 +259,6 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "symview": version("lerobot_policy_symview"),
         }
     )
-
-
-def _in_color(name: str, view: View) -> View:
-    """Return a view without its height, which a policy for images of three channels does not take.
-
-    Raises:
-        ValueError: if the view `name` has one and no option `height` to do without.
-    """
-    if any(option.name == "height" for option in fields(view)):
-        view = replace(view, height=False)
-    single = [output for output, kind in view.outputs.items() if kind == "height"]
-    if single:
-        raise ValueError(
-            f"--for_stock_policies=true takes images of three channels, the view {name!r} has one in "
-            f"{', '.join(single)}: take it out of --views"
-        )
-    return view
 
 
 def main() -> None:

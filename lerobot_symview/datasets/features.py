@@ -6,7 +6,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from lerobot_symview import keys
-from lerobot_symview.geometry.camera import CalibrationError
+from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.units import UNIT_NAMES, Unit
 from lerobot_symview.geometry.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -70,6 +71,18 @@ def view_features(
     return {
         keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()
     }
+
+
+def declared_unit(feature: dict[str, Any]) -> Unit | None:
+    """Return the unit that a depth feature declares, LeRobot's `info["depth_unit"]`; None if it declares none.
+
+    Raises:
+        DatasetError: if the unit is neither `m` nor `mm`.
+    """
+    unit = (feature.get("info") or {}).get("depth_unit")
+    if unit is not None and unit not in UNIT_NAMES:
+        raise DatasetError(f"depth_unit must be one of {', '.join(UNIT_NAMES)}, got {unit!r}")
+    return unit
 
 
 def stored_workspace(features: Features) -> Workspace:

@@ -8,31 +8,31 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.runtime.cli import CommandError, DatasetLocation
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class HubOptions:
-    """Whether and how a dataset goes to the Hub."""
+    """Whether and how a dataset is uploaded to the Hugging Face Hub."""
 
     push_to_hub: bool = False
-    """Upload it to the Hugging Face Hub when it is whole; `hf auth login` first."""
+    """Upload the finished dataset to the Hugging Face Hub; run `hf auth login` first."""
     private: bool = False
-    """Let nobody else see it there."""
+    """Make the repository private."""
     tags: list[str] = field(default_factory=list)
-    """Further tags of its card."""
+    """Additional tags of the dataset card."""
     branch: str | None = None
-    """Branch to upload to, made if it is not there; by default `main`."""
+    """Branch to upload to, created if it does not exist; by default `main`."""
 
 
 @dataclass(frozen=True)
-class PushedDataset(HubOptions, DatasetTarget):
-    """A dataset that goes to the Hub if asked."""
+class HubDataset(HubOptions, DatasetLocation):
+    """A dataset's location, and whether and how the result is uploaded to the Hub."""
 
 
-def push_dataset(target: DatasetTarget, options: HubOptions) -> str:
+def push_dataset(target: DatasetLocation, options: HubOptions) -> str:
     """Upload a dataset with its card, and return its address. What is there already is not sent again.
 
     Raises:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.errors import DatasetError
 
 FORMAT = "v3.0"  # LeRobot's
 MOST_PIXELS = 2**26  # of an image
@@ -21,23 +21,23 @@ def read_info(folder: Path) -> dict[str, Any]:
     """Return what the `meta/info.json` of a dataset says.
 
     Raises:
-        CommandError: if there is none, one of another format, or all that is wrong with it.
+        DatasetError: if there is none, one of another format, or all that is wrong with it.
     """
     file = folder / "meta" / "info.json"
     if not file.is_file():
-        raise CommandError(f"there is no dataset in {folder}: check --dataset.repo_id and --dataset.root")
+        raise DatasetError(f"there is no LeRobot dataset in {folder}")
     try:
         info = json.loads(file.read_text())
     except (ValueError, RecursionError) as error:
-        raise CommandError(f"cannot read {file}: {error}") from None
+        raise DatasetError(f"cannot read {file}: {error}") from None
     if not isinstance(info, dict):
-        raise CommandError(f"{file} must hold an object, got {type(info).__name__}")
+        raise DatasetError(f"{file} must hold an object, got {type(info).__name__}")
     version = info.get("codebase_version")
     if version != FORMAT:
-        raise CommandError(f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot")
+        raise DatasetError(f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot")
     problems = list(_problems(info))
     if problems:
-        raise CommandError(f"{file}: {'; '.join(problems)}")
+        raise DatasetError(f"{file}: {'; '.join(problems)}")
     return info
 
 

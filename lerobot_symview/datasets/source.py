@@ -1,10 +1,12 @@
 """A LeRobot dataset on disk, read episode by episode, and the frames that views are made from.
 
-Tables are read as they are: LeRobot itself, which takes seconds to import, is needed for videos alone.
+Depth is float32 metres behind this module, whatever unit the dataset stores. Tables are read with pyarrow: LeRobot,
+which takes seconds to import, is needed for videos alone.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Buffer, Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,13 +22,16 @@ from pyarrow.compute import struct_field
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.features import Features, declared_unit
 from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb, encoded_size
 from lerobot_symview.datasets.metadata import is_count, pixels, read_info
-from lerobot_symview.geometry.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
+from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.units import UNIT_NAMES, Unit, in_metres, infer_depth_unit
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View
+
+logger = logging.getLogger(__name__)
 
 ROW_BYTES = 2**20  # of a table at most, beside its images
 VIDEO_FRAMES = 64  # decoded at a time
@@ -40,12 +45,13 @@ class SourceDataset:
         folder: where it is.
 
     Raises:
-        CommandError: if there is none, or one of another format.
+        DatasetError: if there is none, or one of another format.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
         self.info = read_info(folder)
+        self._units: dict[str, Unit] = {}
 
     @property
     def features(self) -> Features:
@@ -58,7 +64,7 @@ class SourceDataset:
         files = sorted((self.folder / "meta" / "episodes").rglob("*.parquet"))
         count = sum(pq.read_metadata(file).num_rows for file in files)
         if count != self.info["total_episodes"]:
-            raise CommandError(
+            raise DatasetError(
                 f"{self.folder / 'meta' / 'episodes'} has {count} rows, total_episodes is {self.info['total_episodes']}"
             )
         rows = []
@@ -70,7 +76,7 @@ class SourceDataset:
         return rows
 
     def _check_episodes(self, rows: list[dict[str, Any]]) -> None:
-        """Raise a CommandError unless each row follows the one before, in whole numbers, within all frames."""
+        """Raise a DatasetError unless each row follows the one before, in whole numbers, within all frames."""
         frames, end = self.info["total_frames"], 0
         for index, row in enumerate(rows):
             bounds = {
@@ -85,7 +91,7 @@ class SourceDataset:
                 value = row.get(name)
                 if not is_count(value, least) or (most is not None and value > most):
                     upper = "" if most is None else f" to {most}"
-                    raise CommandError(
+                    raise DatasetError(
                         f"{self.folder / 'meta' / 'episodes'}: episode {index} has {name} {value!r}, "
                         f"expected a whole number from {least}{upper}"
                     )
@@ -119,16 +125,16 @@ class SourceDataset:
         """Where an episode's images of a video feature are.
 
         Raises:
-            CommandError: if the dataset does not say.
+            DatasetError: if the dataset does not say.
         """
         row, template = self.episodes[episode], self.info["video_path"]
         places = {part: row.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
         if template is None or None in places.values():
-            raise CommandError(f"{self.folder / 'meta'} does not say in which video episode {episode} of {key} is")
+            raise DatasetError(f"{self.folder / 'meta'} does not say in which video episode {episode} of {key} is")
         return self.folder / template.format(video_key=key, **places)
 
     def check_files(self, features: Collection[str]) -> None:
-        """Raise a CommandError that names the files which `features` of every episode need and which are not there."""
+        """Raise a DatasetError that names the files which `features` of every episode need and which are not there."""
         videos = [key for key in features if self.features[key]["dtype"] == "video"]
         files = {self.folder / "meta" / "stats.json": None}
         files |= {self.folder / self.data_path(*place): None for place in self._file_starts}
@@ -137,12 +143,12 @@ class SourceDataset:
         missing = [str(file.relative_to(self.folder)) for file in files if not file.is_file()]
         if missing:
             more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-            raise CommandError(
+            raise DatasetError(
                 f"the dataset in {self.folder} lacks {', '.join(missing[:3])}{more}: download or copy it again"
             )
 
     def images(self, key: str, episode: int, table: pa.Table) -> Iterator[NDArray]:
-        """Decode an image or video feature: (H, W, 3) uint8, or (H, W) distances, float metres or integer millimetres.
+        """Decode an image or video feature: (H, W, 3) uint8 colour, or (H, W) float32 depth or height, metres.
 
         Args:
             key: the feature.
@@ -166,9 +172,28 @@ class SourceDataset:
         self._check_size(key, *encoded_size(data))
         if not is_depth_feature(feature):
             return decode_rgb(data)
-        depth = decode_depth(data)
-        in_millimetres = (feature.get("info") or {}).get("depth_unit") == "mm"
-        return depth / np.float32(MILLIMETRES_PER_METRE) if in_millimetres and depth.dtype.kind == "f" else depth
+        return in_metres(decode_depth(data), self.depth_unit(key)).astype(np.float32, copy=False)
+
+    def depth_unit(self, key: str) -> Unit:
+        """Return the unit in which a depth or height feature is stored.
+
+        It is the unit that the feature declares (`info["depth_unit"]`). Without one it is inferred from the first
+        image with a valid pixel, and logged.
+        """
+        if key not in self._units:
+            self._units[key] = declared_unit(self.features[key]) or self._inferred_unit(key)
+        return self._units[key]
+
+    def _inferred_unit(self, key: str) -> Unit:
+        table = EpisodeTables(self, self.data_file(0), [key]).read(0)
+        unit: Unit = "m"
+        for encoded in struct_field(table[key], "bytes"):
+            depth = decode_depth(encoded.as_buffer())
+            if (depth > 0).any():
+                unit = infer_depth_unit(depth)
+                break
+        logger.info("%s declares no depth_unit: its values are taken to be %s", key, UNIT_NAMES[unit])
+        return unit
 
     def _check_size(self, key: str, height: int, width: int) -> None:
         shape = self.features[key]["shape"]
@@ -193,7 +218,7 @@ class SourceDataset:
             moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
             between = (max(moments) - min(moments)) * rate
             if not between < 2 * VIDEO_FRAMES:
-                raise CommandError(f"{file}: {len(moments)} frames of {key} lie {between:.0f} frames of video apart")
+                raise DatasetError(f"{file}: {len(moments)} frames of {key} lie {between:.0f} frames of video apart")
             images = decode_video_frames(file, moments, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
             if is_depth:
                 coding = DepthEncoderConfig.from_video_info(info)
@@ -224,7 +249,7 @@ class EpisodeTables:
         row_bytes = ROW_BYTES + sum(8 * pixels(shape) for shape in images)
         largest = max((group.total_byte_size / max(group.num_rows, 1) for group in groups), default=0)
         if largest > row_bytes:
-            raise CommandError(f"{file} has rows of {largest:.0f} bytes, more than the {row_bytes} its images need")
+            raise DatasetError(f"{file} has rows of {largest:.0f} bytes, more than the {row_bytes} its images need")
         counts = [group.num_rows for group in groups]
         self._starts = np.cumsum([0, *counts])
 
@@ -233,7 +258,7 @@ class EpisodeTables:
         first = self._dataset.first_row(episode)
         count = self._dataset.episodes[episode]["length"]
         if not 0 <= first <= self._starts[-1] - count:
-            raise CommandError(
+            raise DatasetError(
                 f"episode {episode} has rows {first} to {first + count} by length and dataset_from_index, "
                 f"its table has {self._starts[-1]}"
             )
@@ -245,14 +270,14 @@ class EpisodeTables:
 
 @dataclass(frozen=True)
 class FrameReader:
-    """Puts together the frames of one camera.
+    """Assembles the frames of one camera.
 
     Args:
-        dataset: where they are.
-        camera: which camera.
-        workspace: what its views are to show.
-        views: what the frames are for, which decides what they hold.
-        calibration: the camera's, where the dataset has none of its own.
+        dataset: the dataset.
+        camera: name of the camera.
+        workspace: the square on the table that views show.
+        views: the views to render, which decide what a frame must hold.
+        calibration: of the camera, where the dataset has none.
     """
 
     dataset: SourceDataset
@@ -268,8 +293,8 @@ class FrameReader:
 
     @property
     def gripper(self) -> bool:
-        """Whether the gripper's state is wanted."""
-        return any(view.needs_gripper for view in self.views)
+        """Whether the gripper's state is wanted and the dataset has it."""
+        return any(view.uses_gripper for view in self.views) and gripper_dimensions(self.dataset.features) is not None
 
     def features(self) -> list[str]:
         """Return the features that `frames` reads, whether the dataset has them or not."""
@@ -286,21 +311,17 @@ class FrameReader:
         return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
 
     def check(self) -> None:
-        """Raise a ValueError that names what is wanted and not in the dataset, and what can be done."""
+        """Raise a DatasetError that names the features that are wanted and missing."""
         features = self.dataset.features
         missing = [key for key in self.columns() if key not in features]
         depth = keys.depth(self.camera)
         if self.depth and depth in features and not is_depth_feature(features[depth]):
             missing.append(f"{depth} as a depth feature")
-        if self.gripper and keys.STATE in features and gripper_entries(features) is None:
-            missing.append(f"{', '.join(keys.STATE_NAMES)} among the names of {keys.STATE}")
-        if not missing:
-            return
-        cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
-        remedy = f"--camera={self.camera}, calibrated cameras: {', '.join(cameras) or 'none, see --calibration'}"
-        if any(keys.STATE in one for one in missing):
-            remedy += "; to do without the gripper's pose, --reproj.clip=none or metres, --persp.gripper=false"
-        raise ValueError(f"the dataset lacks {', '.join(missing)}; {remedy}")
+        if missing:
+            cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
+            raise DatasetError(
+                f"the dataset lacks {', '.join(missing)}; cameras with calibration: {', '.join(cameras) or 'none'}"
+            )
 
     def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
         """Yield the frames of an episode, whose rows `table` holds.
@@ -312,7 +333,7 @@ class FrameReader:
         depths = self.dataset.images(keys.depth(self.camera), episode, table) if self.depth else repeat(None)
         states: Iterator[Any] = repeat(None)
         if self.gripper:
-            states = iter(vectors(table, keys.STATE)[:, gripper_entries(self.dataset.features)])
+            states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
         matrices: Iterator[Any] = repeat(None)
         if self.calibration is None:
             stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
@@ -342,8 +363,8 @@ def is_depth_feature(feature: dict[str, Any]) -> bool:
     return bool((feature.get("info") or {}).get("is_depth_map"))
 
 
-def gripper_entries(features: Features) -> list[int] | None:
-    """Return which entries of the state are the gripper's x, y, z, yaw and aperture; None if they are not there."""
+def gripper_dimensions(features: Features) -> list[int] | None:
+    """Return the indices of the gripper's x, y, z, yaw and aperture in the state; None if the state lacks one."""
     names = features.get(keys.STATE, {}).get("names")
     if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
         return None

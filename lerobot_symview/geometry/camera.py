@@ -11,12 +11,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_symview.errors import CalibrationError
+
 Array = NDArray[np.float64]
-MILLIMETRES_PER_METRE = 1000.0
-
-
-class CalibrationError(ValueError):
-    """A camera's intrinsics or pose cannot describe a real pinhole camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +43,26 @@ class Camera:
             raise CalibrationError("invalid camera: " + "; ".join(problems))
         object.__setattr__(self, "intrinsics", intrinsics)
         object.__setattr__(self, "world_from_cam", world_from_cam)
+
+    @property
+    def fx(self) -> float:
+        """Focal length along u, pixels."""
+        return float(self.intrinsics[0, 0])
+
+    @property
+    def fy(self) -> float:
+        """Focal length along v, pixels."""
+        return float(self.intrinsics[1, 1])
+
+    @property
+    def cx(self) -> float:
+        """Principal point, u, pixels."""
+        return float(self.intrinsics[0, 2])
+
+    @property
+    def cy(self) -> float:
+        """Principal point, v, pixels."""
+        return float(self.intrinsics[1, 2])
 
     @property
     def position(self) -> Array:
@@ -86,13 +103,6 @@ def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, wid
 @lru_cache(maxsize=256)
 def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int) -> Camera:
     return Camera(np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(world_from_cam).reshape(4, 4), height, width)
-
-
-def depth_in_metres(depth: NDArray) -> NDArray[np.floating]:
-    """Return depth in metres: floating-point depth is in metres already, integers (a RealSense's) are millimetres."""
-    if np.issubdtype(depth.dtype, np.floating):
-        return depth
-    return depth.astype(np.float32) / np.float32(MILLIMETRES_PER_METRE)
 
 
 def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:
@@ -186,10 +196,8 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
     """
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-    fx, fy = camera.intrinsics[0, 0], camera.intrinsics[1, 1]
-    cx, cy = camera.intrinsics[:2, 2]
-    x_over_z = (np.arange(camera.width) - cx) / fx
-    y_over_z = (np.arange(camera.height) - cy) / fy
+    x_over_z = (np.arange(camera.width) - camera.cx) / camera.fx
+    y_over_z = (np.arange(camera.height) - camera.cy) / camera.fy
     z = depth.astype(np.float64)
     points_cam = np.stack([z * x_over_z, z * y_over_z[:, None], z], axis=-1)
     return transform(camera.world_from_cam, points_cam)

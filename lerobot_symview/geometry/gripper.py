@@ -57,7 +57,7 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
     return coverage * z / workspace.height_limit
 
 
-def gripper_picture(
+def gripper_image_uint8(
     state: NDArray[np.floating], workspace: Workspace, pixels: int, shape: GripperShape | None = None
 ) -> NDArray[np.uint8]:
     """Draw the gripper of one state (5,) as `gripper_image` does, in grey levels: (pixels, pixels) uint8, 255 = 1.

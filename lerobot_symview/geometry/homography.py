@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.geometry.camera import Array, CalibrationError, Camera
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
 
 FARTHEST = 30_000.0  # pixels

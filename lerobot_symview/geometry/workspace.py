@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_symview.geometry.camera import Array, CalibrationError, Camera, project
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Array, Camera, project
 
 MINIMUM_VISIBLE = 0.6  # share of the working volume
 

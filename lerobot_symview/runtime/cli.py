@@ -7,24 +7,38 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping
-from contextlib import redirect_stderr
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from lerobot_symview.registry import lookup
+from lerobot_symview.errors import SymviewError
+from lerobot_symview.registry import check_name
 
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval")
 
 
-class CommandError(Exception):
-    """A failure that the user can mend; its message says how. The command ends with exit code 1 and no traceback."""
+class CommandError(SymviewError):
+    """A command cannot do what its flags ask for; the message names the flag to change. Exit code 1, no traceback."""
+
+
+@contextmanager
+def flagged(flag: str) -> Iterator[None]:
+    """Add the command-line flag to the message of a library's error.
+
+    Args:
+        flag: what to change, such as `--calibration=cameras.yaml`.
+    """
+    try:
+        yield
+    except SymviewError as error:
+        raise type(error)(f"{flag}: {error}") from None
 
 
 @dataclass(frozen=True)
-class DatasetTarget:
+class DatasetLocation:
     """Where a dataset is."""
 
     repo_id: str
@@ -88,10 +102,10 @@ def run_command[Config](
         _end(program, _reasons(error), USAGE)
     try:
         main(config)
-    except (CommandError, OSError) as error:
-        _end(program, str(error), FAILURE)
     except ValueError as error:
         _end(program, str(error), USAGE)
+    except (SymviewError, OSError) as error:
+        _end(program, str(error), FAILURE)
     except KeyboardInterrupt:
         _end(program, "interrupted", INTERRUPTED)
     sys.exit(0)
@@ -105,7 +119,7 @@ def subcommand(kind: str, known: Mapping[str, object], default: str = "") -> str
     name = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else default
     try:
         if name or not {"-h", "--help", "--version"} & set(sys.argv[1:]):
-            lookup(kind, name, known)
+            check_name(kind, name, known)
     except ValueError as error:
         _end(Path(sys.argv[0]).name, str(error), USAGE)
     return name

@@ -1,16 +1,17 @@
-"""Views: images from above, made from one camera frame by a pure function with a frozen configuration.
+"""What a view is: a pure function from one camera frame to top-down images, with a frozen configuration.
 
-`VIEWS` is the one registry that the offline command and the online processor step read. A new view is a frozen
-dataclass with the members of `View`, decorated with `@register_view(name)`.
+`VIEWS` is the one registry that the dataset command, the processor step and the simulators read. A new view is a frozen
+dataclass derived from `View` and decorated with `@register_view(name)`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from numbers import Integral
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Self
 
 import cv2
 import numpy as np
@@ -18,132 +19,203 @@ from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.registry import added, lookup
+from lerobot_symview.registry import Registry
 
 SMALLEST, LARGEST = 8, 4096  # rows and columns of a view
+Kind = Literal["rgb", "height"]
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What one camera and the gripper's encoders say at one moment.
+    """One camera's images at one time step, its calibration, and the gripper's state.
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) along the optical axis, float metres or integer millimetres; 0, negative or non-finite = invalid;
-            None without a sensor.
+        depth: (H, W) float, metres along the optical axis; 0, negative or non-finite = invalid; None without a sensor.
         camera: calibration.
-        workspace: what the view shows.
+        workspace: the square on the table that views show.
         gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture; None
-            where it is not known.
+            where it is unknown: then no point is clipped and no gripper image is drawn.
 
     Raises:
-        ValueError: if an image's size is not the camera's, or its type another, or the gripper's state is not finite.
+        ValueError: if an image's shape or dtype is wrong, or the gripper's state is not finite.
     """
 
     rgb: NDArray[np.uint8]
-    depth: NDArray | None
+    depth: NDArray[np.floating] | None
     camera: Camera
     workspace: Workspace
     gripper: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
-        # Compiled kernels read the images by the camera's size and check no index.
+        # Compiled kernels index the images by the camera's size without bounds checks.
         size = (self.camera.height, self.camera.width)
         if self.rgb.shape != (*size, 3) or self.rgb.dtype != np.uint8:
             raise ValueError(f"rgb must be {(*size, 3)} uint8 as its camera, got {self.rgb.shape} {self.rgb.dtype}")
-        if self.depth is not None and (self.depth.shape != size or self.depth.dtype.kind not in "fiu"):
+        if self.depth is not None and (self.depth.shape != size or self.depth.dtype.kind != "f"):
             raise ValueError(
-                f"depth must be {size} float or integer as its camera, got {self.depth.shape} {self.depth.dtype}"
+                f"depth must be {size} float metres as its camera, got {self.depth.shape} {self.depth.dtype}"
             )
         if self.gripper is not None:
             check_gripper(self.gripper.tolist())
 
+    @property
+    def gripper_height(self) -> float | None:
+        """The gripper's height above the table, metres; None where its state is unknown."""
+        return None if self.gripper is None else float(self.gripper[2])
+
 
 def check_gripper(state: list[float]) -> None:
-    """Raise a ValueError for a gripper's state that is not finite: it would cut off or hide all there is."""
+    """Raise a ValueError for a gripper state that is not finite: it would clip all points or none."""
     if not all(map(math.isfinite, state)):
         raise ValueError(f"the gripper's x, y, z, yaw and aperture must be finite, got {state}")
 
 
-class View(Protocol):
-    """A way of looking at a frame from above: a frozen dataclass."""
+class View(ABC):
+    """Top-down images of a frame. Derived classes are frozen dataclasses whose fields are the view's options."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
+    size: int  # rows and columns of every output
 
     @property
-    def size(self) -> int:
-        """Rows and columns of every output."""
-        ...
-
-    @property
-    def outputs(self) -> dict[str, Literal["rgb", "height"]]:
+    @abstractmethod
+    def outputs(self) -> Mapping[str, Kind]:
         """Suffix of the feature -> "rgb" (uint8, (size, size, 3)) or "height" (float32, (size, size), metres)."""
-        ...
 
     @property
     def needs_depth(self) -> bool:
-        """Whether the frame must have depth."""
-        ...
+        """Whether a frame must have depth."""
+        return False
 
     @property
-    def needs_gripper(self) -> bool:
-        """Whether the frame must say where the gripper is."""
-        ...
+    def uses_gripper(self) -> bool:
+        """Whether the outputs depend on the gripper's state, where it is known."""
+        return False
 
+    @abstractmethod
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the image of every output."""
-        ...
+
+    def without_gripper(self) -> Self:
+        """Return the view for frames whose gripper state is unknown."""
+        return self
+
+    def with_mask(self) -> Self:
+        """Return the view with a mask of measured pixels among its outputs, if it has one."""
+        return self
+
+    def in_color(self) -> Self:
+        """Return the view without height maps, for policies that take images of three channels.
+
+        Raises:
+            ValueError: if it has an output of one channel that cannot be left out.
+        """
+        view = replace(self, height=False) if "height" in option_names(type(self)) else self
+        single = [output for output, kind in view.outputs.items() if kind == "height"]
+        if single:
+            raise ValueError(f"the view makes {', '.join(single)}, which has one channel")
+        return view
 
 
-VIEWS: dict[str, Callable[..., View]] = {}
-
-
-def register_view(name: str) -> Callable[[type], type]:
-    """Make a view selectable by `name`."""
-
-    def register(cls: type) -> type:
-        if name in VIEWS:
-            raise ValueError(f"a view named {name!r} is registered already")
-        VIEWS[name] = cls
-        return cls
-
-    return register
+VIEWS: Registry[Callable[..., View]] = Registry(
+    "view",
+    "symview.views",
+    {
+        "reproj": "lerobot_symview.views.reprojection:ReprojectedView",
+        "persp": "lerobot_symview.views.perspective:PerspectiveView",
+    },
+)
+register_view = VIEWS.register
 
 
 def make_view(name: str, **options: Any) -> View:
-    """Return the view `name`, a registered one or an entry point of the group `symview.views`.
+    """Return the view registered as `name`.
 
     Raises:
-        ValueError: if there is none; it names the nearest.
+        ValueError: if there is none, it has no such option, or an option's value is invalid.
     """
-    if name in VIEWS:
-        return VIEWS[name](**options)
-    others = added("symview.views")
-    lookup("view", name, dict.fromkeys((*VIEWS, *others)))
-    view: View = others[name].load()(**options)
-    return view
+    return ViewSpec(name, options).make()
 
 
-def choose_views(names: list[str], size: int | None, options: dict[str, View]) -> dict[str, View]:
-    """Return the views `names`, each as `options` state it or with its defaults, all of `size` pixels if that is given.
+class ViewSpec:
+    """A view as data: its name and its options.
+
+    On a command line and in files it is the name alone, `reproj`, or a mapping, `{name: persp, plane_height: 0.025}`.
+
+    Args:
+        name: as in `VIEWS`.
+        options: keyword arguments of the view; the others have their defaults.
+    """
+
+    def __init__(self, name: str, options: Mapping[str, Any] | None = None):
+        self.name, self.options = name, dict(options or {})
+
+    @classmethod
+    def parse(cls, entry: str | Mapping[str, Any] | ViewSpec) -> ViewSpec:
+        """Return the specification that a name or a mapping states.
+
+        Raises:
+            ValueError: if it is neither.
+        """
+        if isinstance(entry, ViewSpec):
+            return entry
+        if isinstance(entry, str):
+            return cls(entry)
+        if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
+            raise ValueError(f"a view is a name or a mapping with a name and options, got {entry!r}")
+        return cls(entry["name"], {key: value for key, value in entry.items() if key != "name"})
+
+    def make(self) -> View:
+        """Return the view.
+
+        Raises:
+            ValueError: if there is none of that name, it has no such option, or an option's value is invalid.
+        """
+        cls = VIEWS[self.name]
+        known = option_names(cls)
+        unknown = sorted(set(self.options) - set(known))
+        if unknown:
+            raise ValueError(f"the view {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}")
+        return cls(**self.options)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the mapping that `parse` reads."""
+        return {"name": self.name, **self.options}
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ViewSpec) and self.plain() == other.plain()
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def __repr__(self) -> str:
+        return f"ViewSpec({self.name!r}, {self.options!r})"
+
+
+def option_names(view: Any) -> list[str]:
+    """Return the names of a view class's options."""
+    return [option.name for option in fields(view)]
+
+
+def make_views(specs: Iterable[ViewSpec]) -> dict[str, View]:
+    """Return the views by name.
 
     Raises:
-        ValueError: if there is no name, or one that is unknown.
+        ValueError: if there is none, or a name comes twice.
     """
-    if not names:
-        raise ValueError("--views is empty, name at least one view")
-    views = {name: options[name] if name in options else make_view(name) for name in names}
-    return views if size is None else {name: replace(view, size=size) for name, view in views.items()}
+    views: dict[str, View] = {}
+    for spec in specs:
+        if spec.name in views:
+            raise ValueError(f"the view {spec.name!r} is named twice")
+        views[spec.name] = spec.make()
+    if not views:
+        raise ValueError("name at least one view")
+    return views
 
 
 def gray_to_rgb(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Repeat a grey image (H, W) uint8 in three channels: (H, W, 3)."""
     return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
-
-
-def gripper_height(frame: Frame) -> float | None:
-    """Return the gripper's height above the table, metres; None where its state is not known."""
-    return None if frame.gripper is None else float(frame.gripper[2])
 
 
 def check_size(size: int) -> None:

@@ -3,43 +3,63 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import warp_map, warp_plane
-from lerobot_symview.views.base import Frame, check_size, gray_to_rgb, gripper_height, register_view
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views.base import Frame, Kind, View, check_size, gray_to_rgb
 
 
-@register_view("persp")
+def warp_table(
+    rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace, size: int = 152, plane_height: float = 0.0
+) -> NDArray[np.uint8]:
+    """Warp an RGB image to a top-down view of the table's plane (paper section 4.2).
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        camera: its calibration.
+        workspace: the square on the table that is shown.
+        size: rows and columns of the view.
+        plane_height: metres above the table of the plane that is mapped exactly.
+
+    Returns:
+        (size, size, 3) uint8; rows grow with the world's x, columns with y; black where the camera sees no table.
+
+    Raises:
+        ValueError: if the image's shape or dtype is wrong, or the plane lies partly behind the camera.
+    """
+    view = PerspectiveView(size=size, plane_height=plane_height, gripper=False)
+    return view.render(Frame(rgb, None, camera, workspace))["persp"]
+
+
 @dataclass(frozen=True)
-class PerspectiveView:
-    """RGB perspective: a plane parallel to the table warped to lie flat, and the gripper drawn (paper section 4.2)."""
+class PerspectiveView(View):
+    """RGB perspective: a plane parallel to the table warped to a top-down image, and the gripper drawn on it."""
 
     size: int = 152
     """Rows and columns."""
     plane_height: Literal["gripper"] | float = 0.0
     """Metres above the table of the plane that is mapped exactly; `gripper` moves it with the gripper."""
     gripper: bool = True
-    """Add `persp_gripper`: the fingers drawn where they are, the brighter the higher."""
+    """Add `persp_gripper`, the fingers drawn as squares, brighter the higher they are, where the gripper's state is
+    known."""
 
     @property
-    def outputs(self) -> dict[str, Literal["rgb", "height"]]:
+    def outputs(self) -> dict[str, Kind]:
         """The warped image and the gripper image."""
-        outputs: dict[str, Literal["rgb", "height"]] = {"persp": "rgb"}
+        outputs: dict[str, Kind] = {"persp": "rgb"}
         if self.gripper:
             outputs["persp_gripper"] = "rgb"
         return outputs
 
     @property
-    def needs_depth(self) -> bool:
-        """Never."""
-        return False
-
-    @property
-    def needs_gripper(self) -> bool:
-        """To draw it and to follow it."""
+    def uses_gripper(self) -> bool:
+        """To draw it and to move the plane with it."""
         return self.gripper or self.plane_height == "gripper"
 
     def __post_init__(self) -> None:
@@ -49,22 +69,29 @@ class PerspectiveView:
         ):
             raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
+    def without_gripper(self) -> PerspectiveView:
+        """Draw no gripper.
+
+        Raises:
+            ValueError: if the plane is to move with it.
+        """
+        self.plane(None)
+        return replace(self, gripper=False)
+
     def plane(self, gripper_height: float | None) -> float:
         """Return the height of the plane that is mapped exactly, metres, for a gripper at `gripper_height`."""
         if self.plane_height != "gripper":
             return float(self.plane_height)
         if gripper_height is None:
-            raise ValueError("plane_height=gripper needs the gripper's state; without it, state a height in metres")
+            raise ValueError("plane_height=gripper needs the gripper's state; without it, give a height in metres")
         return gripper_height
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return the warped image and the gripper image (grey, brightness = height)."""
-        plane_height = self.plane(gripper_height(frame))
+        """Return the warped image and, where the gripper's state is known, the gripper image."""
+        plane_height = self.plane(frame.gripper_height)
         images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, plane_height))}
-        if self.gripper:
-            if frame.gripper is None:
-                raise ValueError("the gripper image needs the gripper's state; without it, gripper=false")
-            from lerobot_symview.geometry.gripper import gripper_picture  # for the same reason
+        if self.gripper and frame.gripper is not None:
+            from lerobot_symview.geometry.gripper import gripper_image_uint8  # numba
 
-            images["persp_gripper"] = gray_to_rgb(gripper_picture(frame.gripper, frame.workspace, self.size))
+            images["persp_gripper"] = gray_to_rgb(gripper_image_uint8(frame.gripper, frame.workspace, self.size))
         return images

@@ -1,7 +1,7 @@
-"""Views of many frames at once as torch tensors, on whatever device these are, with the bits they have one by one.
+"""Views of a batch of frames as torch tensors, on any device, bit-identical to rendering them one by one.
 
 Every step is a separate operation in float64 or in integers, so that no device may fuse two and round differently. This
-is for GPUs: on a CPU the compiled kernels of `views` are faster.
+is for GPUs: on a CPU the compiled kernels of `lerobot_symview.geometry` are faster.
 """
 
 from __future__ import annotations
@@ -75,21 +75,19 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """Return every output of `view`: (B, 3, size, size) uint8 colour or (B, size, size) float32 metres.
 
     Raises:
-        ValueError: if `can_batch` says no, the frames lack depth or gripper that the view needs, or the gripper's state
-            is not finite.
+        ValueError: if `can_batch` is False, the frames lack depth that the view needs, or the gripper's state is not
+            finite.
     """
     if not can_batch(view):
         raise ValueError(f"{view} is made frame by frame only")
     if view.needs_depth and batch.depth is None:
         raise ValueError("the view needs depth")
-    if view.needs_gripper and batch.gripper is None:
-        raise ValueError("the view needs the gripper's state")
     if isinstance(view, ReprojectedView):
         images = _reproject(view, batch)
     else:
         assert isinstance(view, PerspectiveView)
         images = _warp(view, batch)
-    return {output: images[output] for output in view.outputs}
+    return {output: images[output] for output in view.outputs if output in images}
 
 
 def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
@@ -203,8 +201,7 @@ def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
         weight = (right if dx else FRACTION - right) * (down if dy else FRACTION - down)
         total += torch.where(inside, weight, 0)[:, None] * color
     images = {"persp": ((total + FRACTION**2 // 2) // FRACTION**2).to(torch.uint8)}
-    if view.gripper:
-        assert batch.gripper is not None
+    if view.gripper and batch.gripper is not None:
         drawn = gripper_image(batch.gripper.double(), batch.workspace, view.size)
         grey = torch.round(255 * drawn.clamp(0.0, 1.0)).to(torch.uint8)
         images["persp_gripper"] = grey[:, None].expand(-1, 3, -1, -1)

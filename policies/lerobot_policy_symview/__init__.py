@@ -1,15 +1,16 @@
-"""LeRobot plugin: views, policies and simulated tasks of symview.
+"""LeRobot plugin: top-down views, equivariant policies and simulated tasks.
 
-LeRobot imports this package by the name of its distribution. Importing it registers the policy and environment
+LeRobot imports this package by the name of its distribution. The import registers the policy and environment
 configurations and the processor steps; networks and the simulator are imported when one is built.
 """
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.env_symview import SymviewEnvConfig
+from lerobot_policy_symview.nn.encoders.registry import register_encoder
 from lerobot_policy_symview.processor_allowlist import import_no_steps
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
 import_no_steps()
 
-__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "SymviewSacfdConfig", "ViewsProcessorStep"]
+__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "SymviewSacfdConfig", "ViewsProcessorStep", "register_encoder"]

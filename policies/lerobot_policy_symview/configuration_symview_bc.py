@@ -16,24 +16,24 @@ from lerobot_policy_symview.configuration import SymviewConfig
 @PreTrainedConfig.register_subclass("symview_bc")
 @dataclass
 class SymviewBcConfig(SymviewConfig):
-    """Behaviour cloning from views of a freely placed camera. The defaults are the paper's."""
+    """Behaviour cloning on top-down views from freely placed cameras. The defaults are the paper's."""
 
     learning_rate_decay: Literal["none", "cosine"] = "none"
-    """`cosine` lowers the rate to zero over the training, `none` keeps it, as in the paper."""
+    """`cosine` anneals the learning rate to zero; `none` keeps it constant, as in the paper."""
     aperture_noise: float = 0.0
-    """Standard deviation of noise on the state's `aperture` entries in training, in their unit. Experts open a gripper
-    to the same aperture every time, a policy does not quite; without noise it may take that for something else.
-    """
+    """Standard deviation of noise on the state's `aperture` dimensions in training, in their unit. An expert opens the
+    gripper to exactly the same aperture every time, a policy does not: without noise its own apertures are out of
+    distribution."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_choice("learning_rate_decay", ("none", "cosine"))
         if not 0 <= self.aperture_noise < math.inf:
             raise ValueError(f"--policy.aperture_noise must be finite and at least 0, got {self.aperture_noise}")
-        if self.aperture_noise and not self.states.of_kind("aperture"):
+        if self.aperture_noise and not self.states.of_type("aperture"):
             raise ValueError(
-                f"--policy.aperture_noise={self.aperture_noise} needs an entry `aperture` in --policy.state_symmetry, "
-                f"got {self.state_symmetry}"
+                f"--policy.aperture_noise={self.aperture_noise} needs a dimension `aperture` in "
+                f"--policy.state_symmetry, got {self.state_symmetry}"
             )
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:

@@ -15,7 +15,9 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
 from lerobot_symview.geometry.placement import CameraSpec
-from lerobot_symview.views import PerspectiveView, ReprojectedView, View, choose_views
+from lerobot_symview.geometry.units import Unit
+from lerobot_symview.runtime.view_flags import views_from_flags
+from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 
 # What a simulator process imports; loaded once by the fork server instead of six seconds in each process.
 PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
@@ -42,10 +44,11 @@ class SymviewEnvConfig(EnvConfig):
     """Observe depth."""
     segmentation: bool = False
     """Observe which pixel shows table, robot or which object."""
-    views: list[str] = field(default_factory=list)
-    """Views of the first camera to add to each observation, for policies that do not compute their own."""
+    views: list[ViewSpec] = field(default_factory=list)
+    """Views of the first camera to add to each observation, for policies that do not make their own: by name or with
+    options, `[reproj, {name: persp, plane_height: 0.025}]`."""
     view_size: int | None = None
-    """Rows and columns of those views, in place of each one's own."""
+    """Rows and columns of the views that do not have a size of their own in `views`."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
@@ -67,7 +70,7 @@ class SymviewEnvConfig(EnvConfig):
                 shapes[keys.depth(name)] = (*size, 1)
             if self.segmentation:
                 shapes[keys.segmentation(name)] = (*size, 3)
-        for name, view in self._chosen_views().items():
+        for name, view in self._make_views().items():
             if view.needs_depth and not self.depth:
                 raise ValueError(f"the view {name!r} needs depth: leave --env.depth=true or use 'persp'")
             for output, kind in view.outputs.items():
@@ -79,9 +82,9 @@ class SymviewEnvConfig(EnvConfig):
         }
         self.features_map = {key: key for key in self.features}
 
-    def _chosen_views(self) -> dict[str, View]:
+    def _make_views(self) -> dict[str, View]:
         options: dict[str, View] = {"reproj": self.reproj, "persp": self.persp}
-        return choose_views(self.views, self.view_size, options) if self.views else {}
+        return views_from_flags(self.views, self.view_size, options) if self.views else {}
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -119,7 +122,8 @@ class SymviewEnvConfig(EnvConfig):
         return {task: {0: _LazyAsyncVectorEnv([one.make] * n_envs)} for task, one in settings.items()}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Return the pipeline that adds `views`, and the identity for actions."""
-        options = {name: asdict(view) for name, view in self._chosen_views().items()}
-        step = ViewsProcessorStep(views=options, camera=self.camera.name)
-        return PolicyProcessorPipeline(steps=[step] if options else []), PolicyProcessorPipeline(steps=[])
+        """Return the pipeline that adds `views` and declares depth to be metres, and the identity for actions."""
+        views = [ViewSpec(name, asdict(view)).plain() for name, view in self._make_views().items()]
+        depth_units: dict[str, Unit] = dict.fromkeys((key for key in self.features if key.endswith("_depth")), "m")
+        step = ViewsProcessorStep(views=views, camera=self.camera.name, depth_units=depth_units)
+        return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])

@@ -1,4 +1,4 @@
-"""Checking that a policy is equivariant, from raw observation to the action that is sent to the robot.
+"""Checks that a policy is equivariant, from the raw observation to the action that is sent to the robot.
 
 ```python
 policy = SymviewBcPolicy.from_pretrained(folder)
@@ -14,40 +14,41 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
+from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.nn.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
-from lerobot_policy_symview.symmetry.augmentation import move_images
+from lerobot_policy_symview.symmetry.augmentation import transform_images
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, make_group
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.placement import CameraSpec
 
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10, torch.bfloat16: 5e-2}
 LEAST_SCALE = 0.1
-Observation = dict[str, Tensor]
+ObservationBatch = dict[str, Tensor]
+"""Feature -> (B, ...)."""
 
 
 def assert_equivariant(
     policy: SymviewPolicy,
     processors: tuple[Any, Any] | None = None,
-    observation: Observation | None = None,
+    observation: ObservationBatch | None = None,
     camera: Literal["stays", "moves"] | None = None,
     tolerance: float | None = None,
 ) -> None:
-    """Raise an AssertionError unless the policy acts on moved scenes as on the scene itself, action moved along.
+    """Raise an AssertionError unless the action for a transformed scene is the transformed action.
 
-    Every element of the policy's group that maps pixels onto pixels is tried; the plain network, which has no group, is
-    held to D4.
+    Every element of the policy's group that maps pixels onto pixels is tested; the plain network, which has no group,
+    is tested on D4.
 
     Args:
-        policy: what to check; its mode is left as it was.
-        processors: its pre- and postprocessor; by default those that its configuration makes.
-        observation: what an environment or dataset delivers, batched; by default `example_observation`.
-        camera: whether the camera moves with the scene; by default it does where what it sees is made into the
-            policy's view or lifted to points in space, and stays where the view is there already.
+        policy: its mode is kept unchanged.
+        processors: its pre- and postprocessor; by default those of its configuration.
+        observation: a batch from an environment or dataset; by default `example_observation`.
+        camera: whether the camera moves with the scene; by default it does where its image is made into the policy's
+            view or lifted to points in space, and stays where the observation has the view already.
         tolerance: of `equivariance_errors`; by default 1e-4 in float32, 1e-10 in float64, 0.05 in bf16, whether by
             autocast or by `--policy.dtype`.
     """
@@ -70,14 +71,14 @@ def assert_equivariant(
 def equivariance_errors(
     policy: SymviewPolicy,
     processors: tuple[Any, Any] | None = None,
-    observation: Observation | None = None,
+    observation: ObservationBatch | None = None,
     camera: Literal["stays", "moves"] | None = None,
 ) -> dict[int, float]:
-    """Return, for every element of the group, how far the action on the moved scene is from the moved action.
+    """Return, for every group element, how far the action for the transformed scene is from the transformed action.
 
-    It is the largest difference of any entry, relative to the entry's largest value or, if that is more, a tenth of its
-    range in the data. Elements that do not map pixels
-    onto pixels move images by interpolation, which alone makes a difference. Arguments as for `assert_equivariant`.
+    It is the largest difference of any dimension, relative to the dimension's largest value or, if that is more, a
+    tenth of its range in the data. Elements that do not map pixels onto pixels interpolate images, which alone makes a
+    difference. Arguments as for `assert_equivariant`.
     """
     config = policy.config
     preprocess, postprocess = processors or make_processors(config)
@@ -85,7 +86,7 @@ def equivariance_errors(
     group = checked_group(config)
     training = policy.training
 
-    def act(seen: Observation) -> Tensor:
+    def act(seen: ObservationBatch) -> Tensor:
         action: Tensor = postprocess(policy.select_action(preprocess(dict(seen))))
         return action
 
@@ -95,52 +96,51 @@ def equivariance_errors(
         scale[first] = scale[second] = torch.maximum(scale[first], scale[second])
     errors = {}
     for element in range(1, group.size):
-        motion = Motion.of_element(group, element, action)
-        expected = config.actions.move(action, motion, absolute_yaw=False)
-        actual = act(move_observation(raw, config, group, element, camera))
+        transform = PlanarTransform.of_element(group, element, action)
+        expected = config.actions.transform(action, transform, absolute_yaw=False)
+        actual = act(transform_observation(raw, config, group, element, camera))
         errors[element] = float(((actual - expected).abs().amax(dim=0) / scale).max())
     policy.train(training)
     return errors
 
 
-def move_observation(
-    observation: Observation,
+def transform_observation(
+    observation: ObservationBatch,
     config: SymviewConfig,
     group: PlanarGroup,
     element: int,
     camera: Literal["stays", "moves"] | None = None,
-) -> Observation:
-    """Return what is observed of the scene moved by an element about the workspace's centre.
+) -> ObservationBatch:
+    """Return the observation of the scene transformed by a group element about the workspace centre.
 
     Arguments as for `assert_equivariant`; a camera that moves must be in the observation.
     """
-    moved = dict(observation)
-    moved[keys.STATE] = config.states.move(
-        observation[keys.STATE], Motion.of_element(group, element, observation[keys.STATE]), absolute_yaw=True
+    transformed = dict(observation)
+    transformed[keys.STATE] = config.states.transform(
+        observation[keys.STATE], PlanarTransform.of_element(group, element, observation[keys.STATE]), absolute_yaw=True
     )
-    lifted = config.encoder in LIFTING
-    if not lifted:
+    if not config.sees_points:
         for key in filter(None, (config.color_key, config.height_key)):
             if key in observation:
-                moved[key] = _move_pixels(observation[key], group, element)
+                transformed[key] = _transform_pixels(observation[key], group, element)
     is_raw = config.is_computed and config.color_key not in observation
-    if camera == "moves" or (camera is None and (lifted or is_raw)):
+    if camera == "moves" or (camera is None and (config.sees_points or is_raw)):
         key = keys.world_from_cam(config.camera)
         pose = observation[key].double().view(-1, 4, 4).clone()
         center = pose.new_tensor([*parse_workspace(config.workspace).center, 0.0])
-        turn = torch.eye(3, dtype=pose.dtype, device=pose.device)
-        turn[:2, :2] = torch.from_numpy(group.rotation()[element])
-        pose[:, :3, :3] = turn @ pose[:, :3, :3]  # a mirror image's camera axes are left-handed: so is what it sees
-        pose[:, :3, 3] = (pose[:, :3, 3] - center) @ turn.T + center
+        rotation = torch.eye(3, dtype=pose.dtype, device=pose.device)
+        rotation[:2, :2] = torch.from_numpy(group.rotation()[element])
+        pose[:, :3, :3] = rotation @ pose[:, :3, :3]  # left-handed after a reflection, as the scene is
+        pose[:, :3, 3] = (pose[:, :3, 3] - center) @ rotation.T + center
         if is_raw and group.flips(element):
-            moved |= _mirrored_image(observation, config)
-            pose[:, :3, 0] *= -1  # right-handed again, as views demand: the image is mirrored in its stead
-        moved[key] = pose.flatten(1).to(observation[key].dtype)
-    return moved
+            transformed |= _reflected_image(observation, config)
+            pose[:, :3, 0] *= -1  # right-handed again, as views require: the image is reflected instead
+        transformed[key] = pose.flatten(1).to(observation[key].dtype)
+    return transformed
 
 
-def _mirrored_image(observation: Observation, config: SymviewConfig) -> Observation:
-    """Return a camera's images with their columns reversed, and the intrinsics of that."""
+def _reflected_image(observation: ObservationBatch, config: SymviewConfig) -> ObservationBatch:
+    """Return a camera's images with reversed columns, and the intrinsics that belong to them."""
     images = {key: observation[key].flip(-1) for key in config.raw_keys}
     key = keys.intrinsics(config.camera)
     k = observation[key].clone()
@@ -148,16 +148,16 @@ def _mirrored_image(observation: Observation, config: SymviewConfig) -> Observat
     return images | {key: k}
 
 
-def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> Observation:
-    """Return random images of what the policy reads, a camera's calibration and gripper poses, the same each time."""
+def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> ObservationBatch:
+    """Return random images, a camera's calibration and gripper poses for a policy, the same at every call."""
     generator = torch.Generator().manual_seed(0)
     placed = CameraSpec(name=config.camera).place(parse_workspace(config.workspace))
-    lifted = config.encoder in LIFTING
-    side = placed.height if lifted else 3 * config.crop_size // 2  # a square turned by 45 degrees needs 1.41
+    # a square rotated by 45 degrees needs 1.41 times its side
+    side = placed.height if config.sees_points else 3 * config.crop_size // 2
     state = torch.rand(batch, len(config.state_symmetry), generator=generator, dtype=dtype) - 0.5
     limits = {"x": (0.0, 0.3), "y": (0.0, 0.3), "z": (0.12, 0.15), "aperture": (0.5, 1.0)}
-    for i, entry in enumerate(config.state_symmetry):
-        center, extent = limits.get(entry, (0.0, 2.0))
+    for i, label in enumerate(config.state_symmetry):
+        center, extent = limits.get(label, (0.0, 2.0))
         state[:, i] = center + extent * state[:, i]
     observation = {
         config.color_key: _blotches(batch, 3, side, generator).to(dtype),
@@ -175,9 +175,9 @@ def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float3
     return observation
 
 
-def _move_pixels(images: Tensor, group: PlanarGroup, element: int) -> Tensor:
+def _transform_pixels(images: Tensor, group: PlanarGroup, element: int) -> Tensor:
     if not is_exact(group, element):
-        return move_images(images, Motion.of_element(group, element, images.flatten(1)))
+        return transform_images(images, PlanarTransform.of_element(group, element, images.flatten(1)))
     flipped = images.flip(-1) if group.flips(element) else images
     return torch.rot90(flipped, 4 * (element % group.turns) // group.turns, (-2, -1))
 
@@ -189,7 +189,7 @@ def _blotches(batch: int, channels: int, side: int, generator: torch.Generator) 
 
 
 def checked_group(config: SymviewConfig) -> PlanarGroup:
-    """Return the group a policy is held to."""
+    """Return the group on which a policy is tested."""
     return make_group("D4" if config.group == "C1" else config.group)
 
 
@@ -199,6 +199,6 @@ def is_exact(group: PlanarGroup, element: int) -> bool:
 
 
 def describe(group: PlanarGroup, element: int) -> str:
-    """Return such words as `mirrored, turned by 90 degrees`."""
-    mirrored = "mirrored, " if group.flips(element) else ""
-    return f"{mirrored}turned by {360 * (element % group.turns) / group.turns:g} degrees"
+    """Return a description such as `reflected, rotated by 90 degrees`."""
+    reflected = "reflected, " if group.flips(element) else ""
+    return f"{reflected}rotated by {360 * (element % group.turns) / group.turns:g} degrees"

@@ -49,7 +49,9 @@ def model_card(
         model_name=str(config.type),
     )
     repository = config.repo_id or "user/name"
-    seen = SEEN.get(config.view, f"the view `{config.view}` of the camera `{{camera}}`").format(camera=config.camera)
+    seen = SEEN.get(config.view.name, f"the view `{config.view.name}` of the camera `{{camera}}`").format(
+        camera=config.camera
+    )
     yaw = f"yaw as the representation `{config.theta_representation}`"
     sections = [
         f"---\n{data.to_yaml()}\n---\n",

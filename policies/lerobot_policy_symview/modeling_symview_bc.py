@@ -27,14 +27,14 @@ class SymviewBcPolicy(SymviewPolicy):
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Return the squared error of the scaled action, mean or (B,), and what else the log should show.
+        """Return the squared error of the scaled action, mean or (B,), and metrics for the log.
 
-        That is nothing but for relaxed networks: reading a number from a GPU would make every step wait for it.
+        Only relaxed networks have a metric: reading a number from a GPU makes every step wait for it.
         """
         if self.training and self.config.aperture_noise:
             batch = batch | {keys.STATE: self._noisy(batch[keys.STATE])}
-        picture, state, action = self.training_input(batch)
-        errors = self.network.head.loss(self.network.encoder(picture, state), action).mean(dim=1)
+        observation, state, action = self.training_input(batch)
+        errors = self.network.head.loss(self.network.encoder(observation, state), action).mean(dim=1)
         output = {}
         if self.config.encoder == "relaxed":
             penalty = asymmetry(self.network)
@@ -43,13 +43,13 @@ class SymviewBcPolicy(SymviewPolicy):
         return (errors if reduction == "none" else errors.mean()), output
 
     def _noisy(self, state: Tensor) -> Tensor:
-        """Return states (B, S) with other apertures."""
-        entries = self.config.states.of_kind("aperture")
+        """Return states (B, S) with noise on the apertures."""
+        apertures = self.config.states.of_type("aperture")
         noisy = state.clone()
-        noisy[:, entries] += self.config.aperture_noise * torch.randn_like(noisy[:, entries])
+        noisy[:, apertures] += self.config.aperture_noise * torch.randn_like(noisy[:, apertures])
         return noisy
 
-    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
+    def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
         """Return the scaled action (B, A)."""
-        actions: Tensor = network(picture, state)
+        actions: Tensor = network(observation, state)
         return actions

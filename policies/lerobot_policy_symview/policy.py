@@ -1,4 +1,7 @@
-"""What the policies have in common: the way from an observation to the network's input, and from its output back."""
+"""What the policies share: loading, acting, and the scaling of states and actions.
+
+`lerobot_policy_symview.inputs.scene_input` forms what the network sees.
+"""
 
 from __future__ import annotations
 
@@ -16,59 +19,53 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from lerobot_policy_symview.configuration import LIFTING, SymviewConfig
-from lerobot_policy_symview.inputs.clouds import cloud_from_depth
-from lerobot_policy_symview.inputs.state import StateInput, camera_directions
-from lerobot_policy_symview.inputs.voxels import voxelize
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.inputs.scene_input import make_scene_input
+from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
-from lerobot_policy_symview.nn.encoders.convolutional import make_encoder
-from lerobot_policy_symview.nn.encoders.point_cloud import POINTS
+from lerobot_policy_symview.nn.encoders.registry import make_encoder
 from lerobot_policy_symview.processor_allowlist import check_processor_files
-from lerobot_policy_symview.processor_views import metres_of_depth, metres_of_heights
-from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, crop, move_images, random_motion, scale_down
+from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_transform
 from lerobot_policy_symview.symmetry.groups import make_group
-from lerobot_policy_symview.symmetry.representations import Motion, Symmetry
+from lerobot_policy_symview.symmetry.representations import VectorRepresentation
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import parse_calibration, parse_workspace
-from lerobot_symview.geometry.gripper import gripper_image
-from lerobot_symview.views import ReprojectedView
+from lerobot_symview.calibration.file import parse_workspace
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
-"""Returns the head of an encoder with so many fields for actions that move by a representation (G, A, A)."""
+"""Returns a head for n regular fields and actions that transform by a representation (G, A, A)."""
 
 
 class Network(nn.Module):
     """An encoder and its head.
 
     Args:
-        config: what to build.
-        inputs: the numbers beside the picture.
-        make_head: what makes actions of its fields.
+        config: the policy's.
+        state_input: the vector beside the image.
+        make_head: makes the head.
     """
 
-    def __init__(self, config: SymviewConfig, inputs: StateInput, make_head: MakeHead):
+    def __init__(self, config: SymviewConfig, state_input: StateInput, make_head: MakeHead):
         super().__init__()
         group = make_group(config.group)
-        self.encoder = make_encoder(config, group, inputs.representation(group))
-        self.head: Any = make_head(
-            self.encoder.fields, config.actions.representation(group, config.theta_representation)
-        )
+        self.encoder = make_encoder(config, group, state_input.representation(group))
+        self.head: Any = make_head(self.encoder.fields, config.actions.matrices(group, config.theta_representation))
 
-    def forward(self, picture: Tensor, state: Tensor) -> Any:
-        """Return what the head makes of what the policy sees."""
-        return self.head(self.encoder(picture, state))
+    def forward(self, observation: Tensor, state: Tensor) -> Any:
+        """Return the head's output for an observation and a state (B, D)."""
+        return self.head(self.encoder(observation, state))
 
 
 class SymviewPolicy(PreTrainedPolicy):
-    """Sees, and acts at once: nothing is remembered between steps.
+    """A reactive policy: one observation, one action, no memory.
 
     Its inputs and outputs are physical: images in [0, 1], metres, radians. Everything between commutes with the
-    network's group: the crop in evaluation, the drawn gripper, the scaling of states and actions.
+    network's group: the centre crop, the drawn gripper, the scaling of states and actions.
 
     Args:
-        config: what to build.
-        make_head: what makes actions of the encoder's fields.
-        dataset_stats: ranges of states and actions, which scale them.
+        config: the policy's.
+        make_head: makes the head.
+        dataset_stats: minimum and maximum of states and actions, which scale them.
     """
 
     config_class: Any = SymviewConfig
@@ -83,58 +80,57 @@ class SymviewPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config: SymviewConfig = config
         self.workspace = parse_workspace(config.workspace)
-        stated = parse_calibration(config.calibration) if config.calibration else None
-        self.stated_camera = stated.camera(config.camera) if stated else None
-        self.inputs = StateInput(config, self.workspace)
-        self.network = Network(config, self.inputs, make_head)
+        self.scene = make_scene_input(config, self.workspace)
+        self.state_input = StateInput(config, self.workspace)
+        self.network = Network(config, self.state_input, make_head)
         self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
         stats = dataset_stats or {}
         action = _scale(stats.get(keys.ACTION), config.actions)
-        state = self.inputs.scale(*_scale(stats.get(keys.STATE), config.states))
+        state = self.state_input.scale(*_scale(stats.get(keys.STATE), config.states))
         for name, (center, width) in {"action": action, "state": state}.items():
             self.register_buffer(f"{name}_center", center)
             self.register_buffer(f"{name}_width", width)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
-        """Load a policy, as LeRobot does, unless the processor files beside it ask for more than ours.
+        """Load a policy as LeRobot does, after checking that its processor files name the policy's own steps only.
 
         Raises:
-            ValueError: if they do.
+            ValueError: if they name others.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **options)
         check_processor_files(policy.config, str(pretrained_name_or_path), options)
         return policy
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load weights; an average that they lack begins at the weights themselves."""
+        """Load weights; an average that they lack is initialised with the weights."""
         if self.averaged is not None and not any(name.startswith("averaged.") for name in state_dict):
             trained = {name for name in state_dict if name.startswith("network.")}
-            begun = {name.replace("network.", "averaged.", 1): state_dict[name].clone() for name in trained}
-            state_dict = {**state_dict, **begun}
+            initial = {name.replace("network.", "averaged.", 1): state_dict[name].clone() for name in trained}
+            state_dict = {**state_dict, **initial}
         return super().load_state_dict(state_dict, strict, assign)
 
     @abstractmethod
-    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) by a network, the trained or the averaged one, for what that gets."""
+    def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
+        """Return the scaled action (B, A) that a network, the trained or the averaged one, takes in evaluation."""
 
     def get_optim_params(self) -> Any:
-        """Return every parameter that is trained: one rate for all."""
+        """Return all trained parameters; they share one learning rate."""
         return self.network.parameters()
 
     def update(self) -> None:
-        """Let the averaged weights follow; LeRobot calls this after every optimiser step."""
+        """Update the averaged weights; LeRobot calls this after every optimiser step."""
         if self.averaged is not None:
             with torch.no_grad():
                 for average, current in zip(self.averaged.parameters(), self.network.parameters(), strict=True):
                     average.lerp_(current, 1 - self.config.weight_averaging)
 
     def reset(self) -> None:
-        """Nothing is remembered between steps."""
+        """Do nothing: the policy has no memory."""
 
     @property
     def parameter_count(self) -> int:
-        """How many numbers are trained."""
+        """Number of trained parameters."""
         return sum(parameter.numel() for parameter in self.network.parameters())
 
     def generate_model_card(
@@ -172,7 +168,7 @@ class SymviewPolicy(PreTrainedPolicy):
         return torch.autocast(self.action_center.device.type, torch.bfloat16) if reduced else nullcontext()
 
     def scaled(self, action: Tensor) -> Tensor:
-        """Return what the network learns of actions (B, A): the middle of the range is 0, its ends are -1 and 1."""
+        """Scale actions (B, A): the centre of their range becomes 0, its ends -1 and 1."""
         return (action - self.action_center) / self.action_width
 
     def physical(self, scaled: Tensor) -> Tensor:
@@ -180,104 +176,38 @@ class SymviewPolicy(PreTrainedPolicy):
         return scaled * self.action_width + self.action_center
 
     def training_input(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return `network_input` and the scaled actions (B, A), moved and cut at random if the policy is training."""
-        state, action, motion, place = batch[keys.STATE], batch[keys.ACTION], None, None
+        """Return `network_input` and scaled actions (B, A), with random transforms and crops if the policy trains."""
+        state, action, transform, crop_offset = batch[keys.STATE], batch[keys.ACTION], None, None
         if self.training:
-            motion, place = self.random_motion(state), torch.rand(len(state), 2, device=state.device)
-        if motion is not None:
-            action = self.config.actions.move(action, motion, absolute_yaw=False)
-        return *self.network_input(batch, motion, place), self.scaled(action)
+            transform, crop_offset = self.random_transform(state), torch.rand(len(state), 2, device=state.device)
+        if transform is not None:
+            action = self.config.actions.transform(action, transform, absolute_yaw=False)
+        return *self.network_input(batch, transform, crop_offset), self.scaled(action)
 
-    def random_motion(self, like: Tensor) -> Motion | None:
-        """Draw the motion by which `augmentation` moves each sample of `like` (B, ...); None if it moves none."""
+    def random_transform(self, like: Tensor) -> PlanarTransform | None:
+        """Draw the transform by which `augmentation` changes each sample of `like` (B, ...); None without one."""
         if self.config.augmentation == "none":
             return None
         group = make_group(self.config.group)
-        motions = AUGMENTATIONS | {"group": (group.turns, group.mirrors)}
-        return random_motion(*motions[self.config.augmentation], like)
+        elements = AUGMENTATIONS | {"group": (group.turns, group.mirrors)}
+        return random_transform(*elements[self.config.augmentation], like)
 
     def network_input(
-        self, batch: dict[str, Tensor], motion: Motion | None = None, place: Tensor | None = None
+        self, batch: dict[str, Tensor], transform: PlanarTransform | None = None, crop_offset: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the picture and the state (B, D) that the network gets.
+        """Return the observation and the state (B, D) that the network gets.
 
         Args:
             batch: preprocessed observations.
-            motion: of the scene before it is seen.
-            place: (B, 2) in [0, 1), which of all places images are cut at, row and column; by default the middle.
+            transform: of the scene before it is seen.
+            crop_offset: (B, 2) in [0, 1), row and column relative to the largest offset; by default the centre crop.
         """
-        state = batch[keys.STATE]
-        direction = None
-        if self.config.camera_direction:
-            direction = camera_directions(self._calibration(batch)[1], self.workspace)
-        picture = self._points(batch, motion) if self.config.encoder in LIFTING else self._images(batch)
-        if motion is not None:
-            state = self.config.states.move(state, motion, absolute_yaw=True)
-            if self.config.encoder not in LIFTING:
-                picture = move_images(picture, motion)
-            if direction is not None:
-                direction = torch.stack(motion.move(*direction.unbind(-1)), dim=-1)
-        if self.config.gripper_input == "image":
-            picture = torch.cat([picture, self._gripper(state, picture.shape[-1])[:, None]], dim=1)
-        if self.config.encoder not in LIFTING:
-            picture = crop(picture, self.config.crop_size, place)
-        return picture, self.inputs(state, self.state_center, self.state_width, direction)
-
-    def _images(self, batch: dict[str, Tensor]) -> Tensor:
-        """Colour in [0, 1] and, for `rgbd`, height relative to the working volume (a camera's own depth in metres)."""
-        color = batch[self.config.color_key]
-        if self.config.modality == "rgb":
-            return scale_down(color, self.config.image_size)
-        assert self.config.height_key is not None
-        height = batch[self.config.height_key]
-        height = metres_of_heights(height) if self.config.is_computed else metres_of_depth(height)
-        if self.config.view == "top":  # from straight above, depth is the camera's height less the surface's
-            camera_height = batch[keys.world_from_cam("top")].reshape(-1, 4, 4)[:, 2, 3]
-            height = camera_height[:, None, None, None] - height
-        if self.config.view != "side":
-            height = height / self.workspace.height_limit
-        return scale_down(torch.cat([color, height], dim=1), self.config.image_size)
-
-    def _points(self, batch: dict[str, Tensor], motion: Motion | None) -> Tensor:
-        """The camera's image lifted to space, as voxels (B, 4, Z, X, Y) or as points (B, P, 6)."""
-        camera, view = self.config.camera, ReprojectedView()
-        state, entries = batch[keys.STATE], self.config.state_symmetry
-        gripper_z = state[:, entries.index("z")] if "z" in entries else state.new_full((len(state),), torch.inf)
-        cloud = cloud_from_depth(
-            batch[keys.rgb(camera)],
-            metres_of_depth(batch[keys.depth(camera)]),
-            *self._calibration(batch),
-            self.workspace,
-            (gripper_z - view.clip_margin).clamp(min=view.clip_floor),
-        )
-        if motion is not None:
-            cloud = cloud.moved(motion)
-        if self.config.encoder == "voxel":
-            return voxelize(cloud, self.workspace)
-        return cloud.sample(POINTS, shuffle=self.training)
-
-    def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """K (B, 9) and pose (B, 16) of the camera: the observation's own, or the ones stated for a camera without."""
-        names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
-        if all(name in batch for name in names):
-            return batch[names[0]], batch[names[1]]
-        if self.stated_camera is None:
-            raise KeyError(f"the method {self.config.method!r} needs {names}, the observation has {sorted(batch)}")
-        state, stated = batch[keys.STATE], self.stated_camera
-        k, pose = (
-            torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
-            for matrix in (stated.intrinsics, stated.world_from_cam)
-        )
-        return k, pose
-
-    def _gripper(self, state: Tensor, pixels: int) -> Tensor:
-        """Draw the gripper (B, pixels, pixels)."""
-        entries = [state[:, self.config.state_symmetry.index(kind)] for kind in keys.STATE_NAMES]
-        picture: Tensor = gripper_image(torch.stack(entries, dim=-1), self.workspace, pixels)
-        return picture
+        observation, state = self.scene.form(batch, transform, crop_offset, shuffle=self.training)
+        direction = self.scene.camera_direction(batch, transform)
+        return observation, self.state_input(state, self.state_center, self.state_width, direction)
 
 
-def _scale(stats: dict[str, Any] | None, symmetry: Symmetry) -> tuple[Tensor, Tensor]:
+def _scale(stats: dict[str, Any] | None, representation: VectorRepresentation) -> tuple[Tensor, Tensor]:
     if stats is None:
-        return torch.zeros(len(symmetry.entries)), torch.ones(len(symmetry.entries))
-    return symmetry.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ("min", "max")))
+        return torch.zeros(len(representation.dimensions)), torch.ones(len(representation.dimensions))
+    return representation.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ("min", "max")))

@@ -1,4 +1,4 @@
-"""Pre- and postprocessing of the policies."""
+"""Pre- and postprocessing pipelines of the policies."""
 
 from __future__ import annotations
 
@@ -9,19 +9,30 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.processor_views import ViewsProcessorStep
+from lerobot_policy_symview.processor_views import ViewsProcessorStep, delivered_units
+from lerobot_symview.geometry.units import Unit
 
 
 def make_processors(
-    config: SymviewConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
+    config: SymviewConfig,
+    dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None,
+    depth_units: dict[str, Unit] | None = None,
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's usual pipelines, with the policy's view computed where an observation lacks it.
+    """Return LeRobot's default pipelines, with depth in metres and the policy's view where an observation lacks it.
+
+    Args:
+        config: the policy's.
+        dataset_stats: of LeRobot's normaliser.
+        depth_units: feature -> unit of float depth; by default what LeRobot's loader delivers of the dataset in use.
 
     Raises:
-        ValueError: if that view needs the gripper's pose and the declared state has none.
+        ValueError: if the view uses the gripper's pose and the declared state lacks it.
     """
+    meta = getattr(config, "_runtime_dataset_meta", None)  # LeRobot sets it before it makes the processors
+    if depth_units is None:
+        depth_units = delivered_units(meta) if meta is not None else {}
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         input_steps=[
@@ -29,11 +40,12 @@ def make_processors(
             steps.add_batch_dim,
             steps.to_device,
             ViewsProcessorStep(
-                views=config.computed_views,
+                views=config.views_to_make,
                 camera=config.camera,
                 workspace=config.workspace,
                 calibration=config.calibration,
-                gripper=config.gripper_entries,
+                gripper=config.gripper_indices,
+                depth_units=depth_units,
             ),
             steps.normalize,
         ],

@@ -1,7 +1,8 @@
-"""The processor step that computes views of an observation while a policy runs."""
+"""The processor step that brings depth to metres and renders views while a policy runs."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -15,88 +16,61 @@ from torch import Tensor
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
-from lerobot_symview.geometry.camera import MILLIMETRES_PER_METRE, CalibrationError, Camera, stored_camera
-from lerobot_symview.views import Frame, View, make_view
+from lerobot_symview.datasets.features import declared_unit
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.units import MILLIMETRES_PER_METRE, UNIT_NAMES, Unit, infer_depth_unit, infer_height_unit
+from lerobot_symview.views import Frame, View, ViewSpec, make_views
 
 if TYPE_CHECKING:
     from lerobot_symview.views.torch_backend import FrameBatch
 
-METRES_AT_MOST = 10.0  # nothing on a table is as far or as high, and nothing that is seen is within as many millimetres
+logger = logging.getLogger(__name__)
 
-
-def metres_of_depth(depth: Tensor) -> Tensor:
-    """Return depth in metres, whatever unit LeRobot delivered it in.
-
-    `lerobot-train` converts a dataset's metres to millimetres unless told otherwise and does not say so in the batch,
-    while environments yield metres. What most pixels say decides, so that a few wrong ones change nothing.
-
-    Args:
-        depth: of any shape, integer millimetres (a RealSense's) or float of either unit; 0, negative or non-finite =
-            invalid.
-
-    Returns:
-        The same shape, float (float32 for integers); what is invalid stays so.
-    """
-    if not depth.is_floating_point():
-        return _from_millimetres(depth.float())
-    finite = depth.isfinite()
-    measured, large = finite & (depth > 0), finite & (depth > METRES_AT_MOST)
-    return torch.where(2 * large.sum() > measured.sum(), _from_millimetres(depth), depth)  # a GPU's answer is not read
-
-
-def metres_of_heights(heights: Tensor) -> Tensor:
-    """Return heights above the table in metres, whatever unit LeRobot delivered them in.
-
-    Most of a table is bare, so it is not the majority that decides, as for depth: one height above 10 suffices. A batch
-    of millimetres without any shows nothing higher than 1 cm.
-
-    Args:
-        heights: of any shape, integer millimetres or float of either unit.
-
-    Returns:
-        The same shape, float (float32 for integers); what is not finite stays so.
-    """
-    if not heights.is_floating_point():
-        return _from_millimetres(heights.float())
-    in_millimetres = (heights.isfinite() & (heights > METRES_AT_MOST)).any()
-    return torch.where(in_millimetres, _from_millimetres(heights), heights)
-
-
-def _from_millimetres(lengths: Tensor) -> Tensor:
-    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which gives other bits.
-    return lengths / lengths.new_full((), MILLIMETRES_PER_METRE)
+IN_METRES = "observation.depth_in_metres"  # marks observations whose depth a step has brought to metres
 
 
 @dataclass
 @ProcessorStepRegistry.register(name="symview_views")
 class ViewsProcessorStep(ObservationProcessorStep):
-    """Adds views of one camera to an observation; leaves alone what is already there.
+    """Brings depth to float metres and adds top-down views of one camera; views that are present are kept unchanged.
 
     Colour is float in [0, 1] or uint8. Calibration is flat, (9,) and (16,), or square, (3, 3) and (4, 4), for all
-    frames or for each; an observation without it, such as a real robot's, is taken to have the stated one.
+    frames or for each; an observation without it, such as a real robot's, uses `calibration`.
 
     Args:
-        views: name -> options of every view wanted, as for `lerobot_symview.views.make_view`.
-        camera: the camera they are made from.
+        views: the views to add, by name or as mappings with name and options (`lerobot_symview.views.ViewSpec`).
+        camera: the camera from which they are made.
         workspace: constructor arguments of `Workspace`; by default the calibration's, or the default one.
-        calibration: content of a calibration file (`lerobot_symview.calibration.file`), or nothing.
-        gripper: which entries of `observation.state` are the gripper's x, y, z, yaw and aperture.
+        calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
+        gripper: indices of the gripper's x, y, z, yaw and aperture in `observation.state`; none where the gripper's
+            state is unknown: then nothing is clipped and no gripper image is drawn.
+        depth_units: feature -> `m` or `mm`, the unit in which float depth and height images arrive; the units of others
+            are inferred from their values, which is logged. Integers are millimetres. It is not stored in checkpoints:
+            LeRobot's loader delivers millimetres where an environment delivers metres.
     """
 
-    views: dict[str, dict[str, Any]] = field(default_factory=dict)
+    views: list[Any] = field(default_factory=list)
     camera: str = "side"
     workspace: dict[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
     gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
+    depth_units: dict[str, Unit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._views = {name: make_view(name, **options) for name, options in self.views.items()}
-        stated = parse_calibration(self.calibration) if self.calibration else None
-        self._stated = stated.camera(self.camera) if stated else None
-        self._workspace = (stated and not self.workspace and stated.workspace) or parse_workspace(self.workspace)
+        specs = [ViewSpec.parse(view) for view in self.views]
+        self.views = [spec.plain() for spec in specs]
+        views = make_views(specs) if specs else {}
+        self._views = views if self.gripper else {name: view.without_gripper() for name, view in views.items()}
+        calibration = parse_calibration(self.calibration) if self.calibration else None
+        self._fixed_camera = calibration.camera(self.camera) if calibration else None
+        default = calibration.workspace if calibration and not self.workspace else None
+        self._workspace = default or parse_workspace(self.workspace)
+        self._logged: set[tuple[str, Unit]] = set()
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
-        """Return the observation with what is missing of its views: float32 (B, C, size, size), as any other image."""
+        """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
+        observation = self._in_metres(observation)
         missing = {
             name: view
             for name, view in self._views.items()
@@ -105,8 +79,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
         if not missing:
             return observation
         needs_depth = any(view.needs_depth for view in missing.values())
-        needs_gripper = any(view.needs_gripper for view in missing.values())
-        batch = self._batch(observation, list(missing), needs_depth, needs_gripper)
+        uses_gripper = any(view.uses_gripper for view in missing.values())
+        batch = self._batch(observation, list(missing), needs_depth, uses_gripper)
         for view in missing.values():
             for output, images in _render(view, batch).items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
@@ -114,26 +88,49 @@ class ViewsProcessorStep(ObservationProcessorStep):
         return observation
 
     def get_config(self) -> dict[str, Any]:
-        """Return the constructor's arguments, which a checkpoint stores as JSON."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        """Return the constructor's arguments that a checkpoint stores as JSON."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "depth_units"}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Leave the declared features alone: the policy names what it needs."""
+        """Keep the declared features unchanged: the policy names what it needs."""
         return features
 
+    def _in_metres(self, observation: RobotObservation) -> RobotObservation:
+        """Convert all depth and height images to float metres, once per observation."""
+        if IN_METRES in observation:
+            return observation
+        converted = {
+            key: _metres(values.detach(), self._unit(key, values))
+            for key, values in observation.items()
+            if key.startswith(keys.rgb("")) and key.endswith(("_depth", "_height"))
+        }
+        if not converted:
+            return observation
+        return {**observation, **converted, IN_METRES: torch.ones(())}
+
+    def _unit(self, key: str, values: Tensor) -> Unit:
+        if not values.is_floating_point():
+            return "mm"
+        if key in self.depth_units:
+            return self.depth_units[key]
+        unit = (infer_height_unit if key.endswith("_height") else infer_depth_unit)(values.detach())
+        if (key, unit) not in self._logged:
+            self._logged.add((key, unit))
+            logger.info("%s declares no unit: its values are taken to be %s", key, UNIT_NAMES[unit])
+        return unit
+
     def _batch(
-        self, observation: RobotObservation, views: list[str], needs_depth: bool, needs_gripper: bool
+        self, observation: RobotObservation, views: list[str], needs_depth: bool, uses_gripper: bool
     ) -> FrameBatch:
-        from lerobot_symview.views.torch_backend import (
-            FrameBatch,  # needs numba, which a plugin's import must not wait for
-        )
+        from lerobot_symview.views.torch_backend import FrameBatch  # numba: too slow for a plugin's import
 
         color, depth = keys.rgb(self.camera), keys.depth(self.camera)
-        needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if needs_gripper else [])
+        uses_gripper = uses_gripper and bool(self.gripper)
+        needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if uses_gripper else [])
         matrices = {keys.intrinsics(self.camera): 3, keys.world_from_cam(self.camera): 4}
-        own = self._stated is None or all(key in observation for key in matrices)
+        own = self._fixed_camera is None or all(key in observation for key in matrices)
         missing = [key for key in needed + (list(matrices) if own else []) if key not in observation]
         if missing:
             raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
@@ -145,23 +142,51 @@ class ViewsProcessorStep(ObservationProcessorStep):
             stored = (_matrices(key, observation[key], side, len(rgb)) for key, side in matrices.items())
             cameras = [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
         else:
-            cameras = [self._stated_camera(height, width)] * len(rgb)
+            cameras = [self._calibrated_camera(height, width)] * len(rgb)
         return FrameBatch(
             rgb,
-            metres_of_depth(observation[depth].detach())[:, 0] if needs_depth else None,
+            observation[depth][:, 0] if needs_depth else None,
             cameras,
             self._workspace,
-            observation[keys.STATE].detach()[:, self.gripper] if needs_gripper else None,
+            observation[keys.STATE].detach()[:, self.gripper] if uses_gripper else None,
         )
 
-    def _stated_camera(self, height: int, width: int) -> Camera:
-        assert self._stated is not None
-        if (height, width) != (self._stated.height, self._stated.width):
+    def _calibrated_camera(self, height: int, width: int) -> Camera:
+        assert self._fixed_camera is not None
+        if (height, width) != (self._fixed_camera.height, self._fixed_camera.width):
             raise CalibrationError(
-                f"camera {self.camera!r} is calibrated for {self._stated.height} x {self._stated.width} pixels, "
-                f"the observation has {height} x {width}"
+                f"camera {self.camera!r} is calibrated for {self._fixed_camera.height} x {self._fixed_camera.width} "
+                f"pixels, the observation has {height} x {width}"
             )
-        return self._stated
+        return self._fixed_camera
+
+
+def delivered_units(meta: Any) -> dict[str, Unit]:
+    """Return the unit in which LeRobot's loader delivers each depth feature that declares one.
+
+    The loader converts to `--dataset.depth_output_unit`, which it does not pass on; it rescales the statistics to the
+    same unit, so these tell (`LeRobotDatasetMetadata.rescale_depth_stats`).
+
+    Args:
+        meta: of the `LeRobotDataset`.
+    """
+    from lerobot.datasets.io_utils import load_stats
+
+    stored_stats = load_stats(meta.root) or {}
+    units: dict[str, Unit] = {}
+    for key in meta.depth_keys:
+        unit: Unit | None = declared_unit(meta.features[key])
+        if unit is None or key not in stored_stats or key not in (meta.stats or {}):
+            continue
+        same = np.allclose(meta.stats[key]["max"], stored_stats[key]["max"])
+        units[key] = unit if same else ("m" if unit == "mm" else "mm")
+    return units
+
+
+def _metres(depth: Tensor, unit: Unit) -> Tensor:
+    depth = depth if depth.is_floating_point() else depth.float()
+    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which gives other bits.
+    return depth if unit == "m" else depth / depth.new_full((), MILLIMETRES_PER_METRE)
 
 
 def _matrices(key: str, stated: Tensor, side: int, count: int) -> NDArray[np.floating]:
@@ -193,7 +218,7 @@ def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
         )
         for i, camera in enumerate(batch.cameras)
     ]
-    stacked = {output: torch.from_numpy(np.stack([image[output] for image in images])) for output in view.outputs}
+    stacked = {output: torch.from_numpy(np.stack([image[output] for image in images])) for output in images[0]}
     channels_first = {
         output: image.permute(0, 3, 1, 2) if image.ndim == 4 else image for output, image in stacked.items()
     }

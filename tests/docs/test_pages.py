@@ -51,7 +51,7 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
         hub.users[ALICE] = (page.stem, {page.stem})
         yield page, reader
     shutil.rmtree(reader.dataset(""), ignore_errors=True)
-    registry.added.cache_clear()
+    registry.installed.cache_clear()
 
 
 @pytest.mark.parametrize(

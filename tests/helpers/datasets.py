@@ -1,16 +1,21 @@
-"""Requests for views of a dataset, what a folder holds, and the images of a dataset."""
+"""Requests for views of a dataset, the contents of a folder, and datasets that are changed."""
+
+import json
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview.datasets.add_views import AddViewsConfig
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.datasets.image_codec import decode_depth, encode_metres
 from tests.conftest import VIEW_SIZE
 
 
 def views_config(source, target, **options):
     defaults = {"new_repo_id": "test/derived", "new_root": target, "views": ["reproj", "persp"], "size": VIEW_SIZE}
-    return AddViewsConfig(PushedDataset("test/recorded", source), **(defaults | options))
+    return AddViewsConfig(HubDataset("test/recorded", source), **(defaults | options))
 
 
 def contents(folder):
@@ -20,3 +25,23 @@ def contents(folder):
 def images_of(folder, key):
     dataset = LeRobotDataset("test/images", root=folder, depth_output_unit="m", video_backend="pyav")
     return np.stack([dataset[i][key].numpy() for i in range(len(dataset))])
+
+
+def change_feature(folder, key, **entries):
+    """Change what a dataset declares about a feature."""
+    file = folder / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"][key] = info["features"].get(key, {}) | entries
+    file.write_text(json.dumps(info))
+
+
+def rewrite_depth(folder, key, change):
+    """Replace the depth images (H, W) of a feature."""
+    for file in sorted((folder / "data").rglob("*.parquet")):
+        table = pq.read_table(file)
+        cells = [
+            cell | {"bytes": encode_metres(change(decode_depth(cell["bytes"])))} for cell in table[key].to_pylist()
+        ]
+        column = table.schema.get_field_index(key)
+        changed = pa.array(cells, table.field(column).type)
+        pq.write_table(table.set_column(column, table.field(column), changed), file)

@@ -1,12 +1,25 @@
 """Packages of others, installed for as long as a test runs."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from lerobot_symview import registry
 
 
+@contextmanager
+def registered(names: registry.Registry[Any], name: str, item: Any) -> Iterator[None]:
+    """Register an item for as long as the block runs."""
+    names.register(name)(item)
+    try:
+        yield
+    finally:
+        names.unregister(name)
+
+
 def install(folder: Path, name: str, entry_points: dict[str, dict[str, str]], monkeypatch) -> None:
-    """Make the modules in `folder` and their entry points importable, as pip does; clear `registry.added` after."""
+    """Make the modules in `folder` and their entry points importable, as pip does; clear `registry.installed` after."""
     facts = folder / f"{name}-1.0.dist-info"
     facts.mkdir(parents=True)
     (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
@@ -16,4 +29,4 @@ def install(folder: Path, name: str, entry_points: dict[str, dict[str, str]], mo
     )
     (facts / "entry_points.txt").write_text("".join(groups))
     monkeypatch.syspath_prepend(str(folder.resolve()))
-    registry.added.cache_clear()
+    registry.installed.cache_clear()

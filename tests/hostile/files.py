@@ -15,7 +15,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.replay import Replay, ReplayConfig
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import add_views
-from lerobot_symview.runtime.cli import DatasetTarget
+from lerobot_symview.runtime.cli import DatasetLocation
 from symview_eval.preview import PreviewConfig, preview
 from tests.helpers.datasets import views_config
 
@@ -28,7 +28,7 @@ def derive(dataset, folder):
 
 
 def look(dataset, folder):
-    target = DatasetTarget("test/hostile", dataset)
+    target = DatasetLocation("test/hostile", dataset)
     return preview(PreviewConfig(target, output_dir=folder / "preview", frames=1, rerun=False))
 
 

@@ -6,8 +6,8 @@ import pytest
 
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_symview.calibration.file import read_calibration
-from lerobot_symview.geometry.camera import CalibrationError
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.errors import CalibrationError, SymviewError
+from lerobot_symview.runtime.cli import DatasetLocation
 from tests.hostile.files import (
     both_commands,
     change_info,
@@ -28,7 +28,7 @@ from tests.hostile.files import (
 def test_a_calibration_that_grows_or_ends_in_a_traceback_is_refused(tmp_path, text, message):
     """Every line of aliases multiplies what arrays and messages are made of."""
     (tmp_path / "cameras.yaml").write_text(text)
-    with pytest.raises((CommandError, CalibrationError), match=message):
+    with pytest.raises((SymviewError, CalibrationError), match=message):
         read_calibration(tmp_path / "cameras.yaml")
 
 
@@ -36,7 +36,7 @@ def test_a_calibration_that_grows_or_ends_in_a_traceback_is_refused(tmp_path, te
 @pytest.mark.parametrize("content", [b"[1]", b"\xff\xfe", b"[" * 100_000, b"{", b'{"codebase_version": "v3.0"}'])
 def test_metadata_that_is_none_is_refused(dataset, tmp_path, command, content):
     (dataset / "meta" / "info.json").write_bytes(content)
-    with pytest.raises(CommandError, match=r"info\.json"):
+    with pytest.raises(SymviewError, match=r"info\.json"):
         command(dataset, tmp_path)
 
 
@@ -45,14 +45,14 @@ def test_metadata_that_is_none_is_refused(dataset, tmp_path, command, content):
 def test_features_that_are_none_are_refused(dataset, tmp_path, command, feature):
     features = json.loads((dataset / "meta" / "info.json").read_text())["features"]
     change_info(dataset, features=features | {"strange": feature})
-    with pytest.raises(CommandError, match="strange"):
+    with pytest.raises(SymviewError, match="strange"):
         command(dataset, tmp_path)
 
 
 @pytest.mark.parametrize("entries", [{"chunks_size": 0}, {"chunks_size": "x"}, {"total_frames": "many"}])
 def test_counts_in_metadata_are_counts(dataset, tmp_path, entries):
     change_info(dataset, **entries)
-    with pytest.raises(CommandError, match=next(iter(entries))):
+    with pytest.raises(SymviewError, match=next(iter(entries))):
         derive(dataset, tmp_path)
 
 
@@ -60,5 +60,5 @@ def test_harmless_files_are_read(dataset, checkpoint, tmp_path):
     """The same commands on what was not changed."""
     for command in (derive, look):
         assert command(dataset, tmp_path).is_dir()
-    assert len(open_dataset(DatasetTarget("test/harmless", dataset))) == 14
+    assert len(open_dataset(DatasetLocation("test/harmless", dataset))) == 14
     assert load_with_processors(checkpoint)

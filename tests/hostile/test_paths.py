@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from lerobot_policy_symview.rl.demonstrations import open_dataset
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.errors import SymviewError
+from lerobot_symview.runtime.cli import DatasetLocation
 from tests.hostile.files import (
     DATA,
     EPISODES,
@@ -40,7 +41,7 @@ TEMPLATES = [
 def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template):
     stated = template.replace("PRIVATE", str(outside)) if isinstance(template, str) else template
     change_info(dataset, data_path=stated)
-    with pytest.raises(CommandError, match="data_path"):
+    with pytest.raises(SymviewError, match="data_path"):
         command(dataset, tmp_path)
 
 
@@ -48,7 +49,7 @@ def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template
 @pytest.mark.parametrize("template", [*TEMPLATES[:-3], "videos/{video_key.__class__}/{video_key}.mp4"])
 def test_videos_are_in_the_dataset(dataset, outside, tmp_path, command, template):
     make_video_feature(dataset, template.replace("PRIVATE", str(outside)))
-    with pytest.raises(CommandError, match="video_path"):
+    with pytest.raises(SymviewError, match="video_path"):
         command(dataset, tmp_path)
 
 
@@ -59,7 +60,7 @@ def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, t
     change_columns(dataset / EPISODES, **{"data/chunk_index": 2, "data/file_index": 77})
     (dataset / "77" / "77").mkdir(parents=True)
     (dataset / DATA).rename(dataset / "77" / "77" / "stray77.parquet")
-    with pytest.raises(CommandError, match="data_path"):
+    with pytest.raises(SymviewError, match="data_path"):
         derive(dataset, tmp_path)
     assert not list(tmp_path.rglob("stray0.parquet"))
 
@@ -69,7 +70,7 @@ def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, t
 def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, place):
     change_info(dataset, data_path="data/{chunk_index}/file-{file_index:03d}.parquet")
     change_columns(dataset / EPISODES, **{"data/chunk_index": place})
-    with pytest.raises(CommandError, match="chunk_index"):
+    with pytest.raises(SymviewError, match="chunk_index"):
         command(dataset, tmp_path)
 
 
@@ -80,7 +81,7 @@ def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, nam
     (dataset / "videos").mkdir()
     video = {"dtype": "video", "shape": [8, 8, 3], "names": ["height", "width", "channels"], "info": {}}
     change_feature(dataset, name.replace("PRIVATE", str(outside)), **video)
-    with pytest.raises(CommandError, match=r"info\.json: the feature"):
+    with pytest.raises(SymviewError, match=r"info\.json: the feature"):
         command(dataset, tmp_path)
     assert list(tmp_path.rglob("secret.txt")) == [outside / "secret.txt"]
 
@@ -97,5 +98,5 @@ def test_an_image_in_a_file_elsewhere_is_not_read(dataset, tmp_path, command):
 def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
     (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
     change_image(dataset, RGB, None, tmp_path / "secret.png")
-    with pytest.raises(CommandError, match=RGB):
-        open_dataset(DatasetTarget("test/hostile", dataset))
+    with pytest.raises(SymviewError, match=RGB):
+        open_dataset(DatasetLocation("test/hostile", dataset))

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview.calibration.file import read_calibration
-from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.errors import SymviewError
 from tests.hostile.files import saved_replay
 
 ROOT = Path(__file__).parents[2]
@@ -63,6 +63,6 @@ def test_a_pickled_replay_is_refused_unread(tmp_path):
 @pytest.mark.parametrize("tag", ["object/apply:os.system [touch {}]", "object/new:pathlib.Path [{}]", "name:os.system"])
 def test_a_calibration_cannot_name_python_objects(tmp_path, tag):
     (tmp_path / "cameras.yaml").write_text(f"units: !!python/{tag.format(tmp_path / 'run')}")
-    with pytest.raises(CommandError, match="could not determine a constructor"):
+    with pytest.raises(SymviewError, match="could not determine a constructor"):
         read_calibration(tmp_path / "cameras.yaml")
     assert not (tmp_path / "run").exists()

@@ -15,8 +15,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.geometry.camera import CalibrationError
-from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.helpers.cameras import make_camera
@@ -85,7 +84,7 @@ def test_no_more_of_a_video_is_decoded_than_there_are_frames(dataset, tmp_path):
     write_video(dataset, 152, 152, frames=400)
     moments = pq.read_table(dataset / DATA)["timestamp"].to_numpy() * 50
     change_columns(dataset / DATA, timestamp=pa.array(moments, pa.float32()))
-    with pytest.raises(CommandError, match="frames of video apart"):
+    with pytest.raises(SymviewError, match="frames of video apart"):
         derive(dataset, tmp_path)
 
 
@@ -99,7 +98,7 @@ def test_declarations_of_symmetry_are_no_longer_than_a_robot_has_entries():
 )
 def test_declared_shapes_of_images_are_possible(dataset, shape):
     change_feature(dataset, RGB, shape=shape)
-    with pytest.raises(CommandError, match=f"{RGB}.*shape"):
+    with pytest.raises(SymviewError, match=f"{RGB}.*shape"):
         SourceDataset(dataset)
 
 
@@ -107,7 +106,7 @@ def test_there_are_no_more_episodes_than_declared(dataset):
     """Rows that are alike take next to nothing in a file."""
     table = pq.read_table(dataset / EPISODES)
     pq.write_table(table.take(pa.array(np.zeros(20_000, int))), dataset / EPISODES, compression="zstd")
-    with pytest.raises(CommandError, match=r"20000.*total_episodes"):
+    with pytest.raises(SymviewError, match=r"20000.*total_episodes"):
         len(SourceDataset(dataset).episodes)
 
 
@@ -127,7 +126,7 @@ def test_there_are_no_more_episodes_than_declared(dataset):
 def test_episodes_are_where_there_are_frames(dataset, tmp_path, command, column, value):
     values = pq.read_table(dataset / EPISODES)[column].to_pylist()
     change_columns(dataset / EPISODES, **{column: pa.array([*map(type(value), values[:-1]), value])})
-    with pytest.raises(CommandError, match=column):
+    with pytest.raises(SymviewError, match=column):
         command(dataset, tmp_path)
 
 
@@ -135,11 +134,11 @@ def test_episodes_are_where_there_are_frames(dataset, tmp_path, command, column,
 def test_rows_are_no_larger_than_declared(dataset, tmp_path, command):
     """64 MiB of zeros that a table of a few kilobytes unpacks to."""
     change_image(dataset, RGB, bytes(2**26))
-    with pytest.raises(CommandError, match=r"file-000\.parquet.*bytes"):
+    with pytest.raises(SymviewError, match=r"file-000\.parquet.*bytes"):
         command(dataset, tmp_path)
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", list(VIEWS))
 def test_views_are_of_a_possible_size(view):
     with pytest.raises(ValueError, match="size must"):
         make_view(view, size=10**6)

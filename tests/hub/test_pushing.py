@@ -18,7 +18,7 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset, push_dataset
+from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.runtime.cli import CommandError
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
@@ -46,7 +46,7 @@ def hub():
 def target(recorded, tmp_path):
     """A dataset on disk that alice may push."""
     folder = shutil.copytree(recorded, tmp_path / "recorded")
-    return PushedDataset("alice/picking", folder)
+    return HubDataset("alice/picking", folder)
 
 
 def local_files(folder):
@@ -159,7 +159,7 @@ def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
 def test_a_stock_policy_brings_its_view_along_to_another_process(policy, options, recorded, tmp_path, monkeypatch):
     """Trained on a view, with our step in its preprocessing: who has the plugin evaluates it from the Hub."""
     config = AddViewsConfig(
-        PushedDataset("test/recorded", recorded),
+        HubDataset("test/recorded", recorded),
         new_root=tmp_path / "stock",
         views=["reproj"],
         size=VIEW_SIZE,
@@ -172,7 +172,7 @@ def test_a_stock_policy_brings_its_view_along_to_another_process(policy, options
     lerobot_train.main()
     checkpoint = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     preprocessor = make_pre_post_processors(PreTrainedConfig.from_pretrained(checkpoint), str(checkpoint))[0]
-    step = ViewsProcessorStep(views={"reproj": {"size": VIEW_SIZE, "height": False}})
+    step = ViewsProcessorStep(views=[{"name": "reproj", "size": VIEW_SIZE, "height": False}])
     preprocessor.steps.insert(-1, step)  # before the normalisation
     preprocessor.save_pretrained(checkpoint)
     same_name = json.dumps({"observation.images.side": "observation.images.side"})

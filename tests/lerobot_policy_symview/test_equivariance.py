@@ -12,13 +12,14 @@ from lerobot_policy_symview.equivariance import (
     checked_group,
     equivariance_errors,
     example_observation,
-    move_observation,
+    transform_observation,
 )
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
+from lerobot_symview.views import ViewSpec
 from symview_sim.env import SymviewEnv
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
@@ -59,9 +60,9 @@ def test_the_training_loss_is_invariant(method):
 
     expected = losses(dict(batch))
     for element in range(1, group.size):
-        motion = Motion.of_element(group, element, batch[keys.ACTION])
-        moved = move_observation(batch, config, group, element)
-        moved[keys.ACTION] = config.actions.move(batch[keys.ACTION], motion, absolute_yaw=False)
+        motion = PlanarTransform.of_element(group, element, batch[keys.ACTION])
+        moved = transform_observation(batch, config, group, element)
+        moved[keys.ACTION] = config.actions.transform(batch[keys.ACTION], motion, absolute_yaw=False)
         torch.testing.assert_close(losses(moved), expected, rtol=1e-10, atol=1e-12)
 
 
@@ -151,7 +152,7 @@ def test_another_robot_needs_only_another_declaration():
         action_symmetry=["aperture", "ry", "yaw", "y", "z", "x", "rx"],
         state_symmetry=["scalar", "y:wrist", "x:wrist", "z", "sign"],
         gripper_input="vector",
-        view_options={"clip": "none"},
+        view=ViewSpec("reproj", {"clip": "none"}),
     )
     take_training_steps(policy)
     assert_equivariant(policy)
@@ -159,7 +160,7 @@ def test_another_robot_needs_only_another_declaration():
         action_symmetry=["aperture", "ry", "yaw", "x", "z", "y", "rx"],
         state_symmetry=policy.config.state_symmetry,
         gripper_input="vector",
-        view_options={"clip": "none"},
+        view=ViewSpec("reproj", {"clip": "none"}),
     )
     wrong.load_state_dict(policy.state_dict())
     wrong.config.action_symmetry = policy.config.action_symmetry
@@ -176,7 +177,7 @@ def test_another_robot_needs_only_another_declaration():
     ],
 )
 def test_every_orientation_in_the_state_turns_along(state, gripper_input):
-    options = {"view_options": {"clip": "none"}, "gripper_input": gripper_input}
+    options = {"view": ViewSpec("reproj", {"clip": "none"}), "gripper_input": gripper_input}
     policy = make_policy(state_symmetry=state, **options)
     take_training_steps(policy)
     assert_equivariant(policy)
@@ -199,14 +200,15 @@ def raw():
 @pytest.mark.parametrize(
     ("method", "options", "turned", "mirrored"),
     [
-        ("persp_equi", {}, 1e-4, 1e-4),
+        ("persp_equi", {"size": 76}, 1e-4, 1e-4),
         ("voxel_equi", {}, 1e-4, 1e-4),
-        ("reproj_equi", {"infill": "none"}, 1e-4, 0.1),
-        ("reproj_equi", {"infill": "nearest"}, 0.2, 0.2),
+        ("reproj_equi", {"size": 76, "infill": "none"}, 1e-4, 0.1),
+        ("reproj_equi", {"size": 76, "infill": "nearest"}, 0.2, 0.2),
     ],
 )
 def test_policies_turn_from_the_raw_image_on(raw, method, options, turned, mirrored):
-    policy = make_policy(method=method, view_options={"size": 76, **options})
+    view = ViewSpec(METHODS[method]["view"], options)
+    policy = make_policy(method=method, view=view)
     take_training_steps(policy)
     errors = equivariance_errors(policy, observation=raw)
     assert max(errors[element] for element in (1, 2, 3)) < turned
@@ -219,8 +221,8 @@ def test_an_observation_is_moved_and_moved_back():
     group = checked_group(config)
     raw = example_observation(config, torch.float64)
     for element in range(group.size):
-        there = move_observation(raw, config, group, element, camera="moves")
-        back = move_observation(there, config, group, int(group.inverse[element]), camera="moves")
+        there = transform_observation(raw, config, group, element, camera="moves")
+        back = transform_observation(there, config, group, int(group.inverse[element]), camera="moves")
         for key, value in raw.items():
             difference = back[key] - value
             if key == keys.STATE:

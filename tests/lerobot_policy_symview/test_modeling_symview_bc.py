@@ -5,15 +5,16 @@ import torch
 from lerobot.configs.types import NormalizationMode
 from lerobot.policies.factory import make_pre_post_processors
 
-from lerobot_policy_symview.configuration import CHOICES, CROP_SIZES, ENCODER_NAMES
+from lerobot_policy_symview.configuration import CHOICES, CROP_SIZES
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.equivariance import example_observation
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.nn.encoders.convolutional import ENCODERS
+from lerobot_policy_symview.nn.encoders.registry import ENCODERS
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
 from lerobot_symview.views import VIEWS, ReprojectedView
+from tests.helpers.packages import registered
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
 
@@ -281,7 +282,7 @@ def test_the_camera_may_be_stated_in_place_of_observed(method):
 
 def test_a_stated_option_wins_over_the_methods():
     config = SymviewBcConfig(device="cpu", method="sideview_equi", modality="rgb", encoder="plain")
-    assert (config.view, config.modality, config.encoder, config.group) == ("side", "rgb", "plain", "C1")
+    assert (config.view.name, config.modality, config.encoder, config.group) == ("side", "rgb", "plain", "C1")
 
 
 def test_a_side_view_is_that_of_the_named_camera():
@@ -290,15 +291,16 @@ def test_a_side_view_is_that_of_the_named_camera():
 
 
 def test_the_configuration_offers_what_the_networks_have():
-    assert tuple(ENCODERS) == ENCODER_NAMES
+    for encoder in ENCODERS.builtin:
+        assert ENCODERS[encoder]
     for crop_size in CROP_SIZES:
         SymviewBcPolicy(make_config(crop_size=crop_size))
     for preset in METHODS.values():
         assert all(value in CHOICES[name] for name, value in preset.items() if name in CHOICES)
 
 
-def test_a_view_that_is_registered_later_is_a_choice_too(monkeypatch):
-    monkeypatch.setitem(VIEWS, "other", ReprojectedView)
-    assert make_config(view="other", modality="rgb").computed_views.keys() == {"other"}
-    with pytest.raises(ValueError, match="did you mean 'other'"):
-        make_config(view="othr", modality="rgb")
+def test_a_view_that_is_registered_later_is_a_choice_too():
+    with registered(VIEWS, "other", ReprojectedView):
+        assert [spec.name for spec in make_config(view="other", modality="rgb").views_to_make] == ["other"]
+        with pytest.raises(ValueError, match="did you mean 'other'"):
+            make_config(view="othr", modality="rgb")

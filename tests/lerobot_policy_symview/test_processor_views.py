@@ -7,12 +7,14 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview.processor_pipelines import make_processors
-from lerobot_policy_symview.processor_views import ViewsProcessorStep, metres_of_depth, metres_of_heights
+from lerobot_policy_symview.processor_views import IN_METRES, ViewsProcessorStep, delivered_units
 from lerobot_policy_symview.rl.rollouts import observed as simulated
 from lerobot_symview import keys
-from lerobot_symview.geometry.camera import CalibrationError, depth_in_metres, stored_camera
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import stored_camera
+from lerobot_symview.geometry.units import in_metres as in_metres_offline
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import VIEWS, Frame, make_view
+from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view
 from lerobot_symview.views.reprojection import INFILLS
 from symview_sim.demonstration import episode_seed
 from symview_sim.env import SymviewEnv
@@ -20,7 +22,8 @@ from symview_sim.settings import EnvSettings
 from tests.conftest import VIEW_SIZE
 from tests.helpers.policies import make_config
 
-OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
+OPTIONS = [{"name": name, "size": VIEW_SIZE} for name in VIEWS]
+REPROJ = {"name": "reproj", "size": VIEW_SIZE}
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +88,9 @@ def test_with_any_options_and_depth_the_step_gives_the_bits_of_the_view(observed
     rgb = (observed[keys.rgb("side")][0] * 255).round().byte().permute(1, 2, 0).numpy()
     depth = sensed(observed[keys.depth("side")][0, 0].numpy())
     camera = stored_camera(*matrices, *depth.shape)
-    offline = view.render(Frame(rgb, depth, camera, Workspace(), observed[keys.STATE][0].numpy()))
+    offline = view.render(Frame(rgb, in_metres_offline(depth), camera, Workspace(), observed[keys.STATE][0].numpy()))
     observation = observed | {keys.depth("side"): torch.from_numpy(depth)[None, None]}
-    online = ViewsProcessorStep(views={name: {"size": VIEW_SIZE} | options}).observation(observation)
+    online = ViewsProcessorStep(views=[{"name": name, "size": VIEW_SIZE} | options]).observation(observation)
     assert offline.keys() == view.outputs.keys()
     for output, image in offline.items():
         expected = image.transpose(2, 0, 1) / np.float32(255) if image.ndim == 3 else image[None]
@@ -98,7 +101,7 @@ def test_with_any_options_and_depth_the_step_gives_the_bits_of_the_view(observed
 
 
 def test_a_view_that_is_present_is_left_alone(observed):
-    step = ViewsProcessorStep(views={"reproj": {}})
+    step = ViewsProcessorStep(views=["reproj"])
     first = step.observation(dict(observed))
     marked = first | {"observation.images.side_reproj": torch.zeros(1, 3, 4, 4)}
     assert step.observation(marked)["observation.images.side_reproj"].shape == (1, 3, 4, 4)
@@ -106,7 +109,7 @@ def test_a_view_that_is_present_is_left_alone(observed):
 
 @pytest.mark.parametrize("missing", make_view("reproj").outputs)
 def test_of_a_view_only_what_is_missing_is_added(observed, missing):
-    step = ViewsProcessorStep(views={"reproj": OPTIONS["reproj"]})
+    step = ViewsProcessorStep(views=[REPROJ])
     own = step.observation(dict(observed))
     outputs = [keys.view("side", output) for output in make_view("reproj").outputs]
     marked = own | {key: torch.full_like(own[key], 0.5) for key in outputs}
@@ -197,10 +200,10 @@ def reordered(observed):
 @pytest.mark.parametrize("method", ["reproj_equi", "persp_equi"])
 def test_a_state_of_another_order_gives_the_same_view(observed, method):
     state, kinds = reordered(observed)
-    options = {"plane_height": "gripper"} if method == "persp_equi" else {}
-    usual = make_config(method=method, view_options=options)
+    view = ViewSpec("persp", {"plane_height": "gripper"}) if method == "persp_equi" else ViewSpec("reproj")
+    usual = make_config(method=method, view=view)
     expected = make_processors(usual)[0](dict(observed))
-    config = make_config(method=method, view_options=options, state_symmetry=kinds)
+    config = make_config(method=method, view=view, state_symmetry=kinds)
     seen = make_processors(config)[0](dict(state))
     for key in filter(None, (config.color_key, config.height_key if method == "reproj_equi" else None)):
         assert torch.equal(seen[key], expected[key]), key
@@ -210,7 +213,7 @@ def test_a_view_that_needs_a_gripper_is_refused_where_the_state_has_none(observe
     options = {"state_symmetry": ["x", "y", "scalar", "sign", "scalar"], "gripper_input": "vector"}
     with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* lacks \['z', 'yaw', 'aperture'\].*clip: none"):
         make_processors(make_config(**options))
-    config = make_config(**options, view_options={"clip": "none"})
+    config = make_config(**options, view=ViewSpec("reproj", {"clip": "none"}))
     assert config.color_key in make_processors(config)[0](dict(observed))
 
 
@@ -228,41 +231,93 @@ def test_missing_inputs_are_named(observed):
         ViewsProcessorStep(views=OPTIONS).observation(without)
 
 
+DEPTH, HEIGHT = keys.depth("side"), keys.view("side", "reproj_height")
+
+
+def metres(key, values, **units):
+    made = ViewsProcessorStep(depth_units=units.get("units", {})).observation({key: values})
+    assert IN_METRES in made
+    return made[key]
+
+
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 12.0, -12.0, 0.0])
-def test_a_wrong_pixel_does_not_change_the_unit_of_depth(wrong):
+def test_a_wrong_pixel_does_not_change_an_inferred_depth_unit(wrong):
     depth = torch.tensor([0.0, 0.8, 1.2, wrong])
-    torch.testing.assert_close(metres_of_depth(depth), depth, equal_nan=True)
-    torch.testing.assert_close(metres_of_depth(depth * 1000), depth, equal_nan=True)
+    torch.testing.assert_close(metres(DEPTH, depth), depth, equal_nan=True)
+    torch.testing.assert_close(metres(DEPTH, depth * 1000), depth, equal_nan=True)
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 0.0])
-def test_one_height_tells_millimetres(wrong):
+def test_one_height_decides_an_inferred_height_unit(wrong):
     heights = torch.tensor([0.0, 0.0, 0.0, 0.001, 0.03, wrong])
-    torch.testing.assert_close(metres_of_heights(heights), heights, equal_nan=True)
-    torch.testing.assert_close(metres_of_heights(heights * 1000), heights, equal_nan=True)
+    torch.testing.assert_close(metres(HEIGHT, heights), heights, equal_nan=True)
+    torch.testing.assert_close(metres(HEIGHT, heights * 1000), heights, equal_nan=True)
 
 
-@pytest.mark.parametrize("in_metres", [metres_of_depth, metres_of_heights])
+@pytest.mark.parametrize("key", [DEPTH, HEIGHT])
+def test_a_declared_unit_decides_whatever_the_values(key, caplog):
+    low = torch.tensor([0.0, 1.0, 9.0])  # millimetres of a nearly bare table
+    torch.testing.assert_close(metres(key, low, units={key: "mm"}), low / 1000)
+    far = torch.tensor([20.0, 30.0])
+    torch.testing.assert_close(metres(key, far, units={key: "m"}), far)
+    assert not caplog.messages
+
+
+def test_an_inferred_unit_is_logged_once(caplog):
+    caplog.set_level("INFO")
+    step = ViewsProcessorStep()
+    for _ in range(2):
+        step.observation({DEPTH: torch.tensor([800.0])})
+    assert caplog.messages == [f"{DEPTH} declares no unit: its values are taken to be millimetres"]
+
+
+def test_depth_is_converted_once():
+    step = ViewsProcessorStep(depth_units={DEPTH: "mm"})
+    first = step.observation({DEPTH: torch.tensor([800.0])})
+    assert torch.equal(step.observation(dict(first))[DEPTH], first[DEPTH])
+
+
+@pytest.mark.parametrize("output_unit", ["m", "mm"])
+def test_the_unit_that_lerobots_loader_delivers_is_known(with_views, output_unit):
+    dataset = LeRobotDataset("test/with_views", root=with_views, depth_output_unit=output_unit)
+    units = delivered_units(dataset.meta)
+    assert units[DEPTH] == units[HEIGHT] == output_unit
+    made = metres(DEPTH, dataset[0][DEPTH][None], units=units)
+    assert 0.3 < float(made.median()) < 2
+
+
+@pytest.mark.parametrize("key", [DEPTH, HEIGHT])
 @pytest.mark.parametrize("dtype", [torch.uint16, torch.int16, torch.int32])
-def test_integers_are_millimetres(in_metres, dtype):
+def test_integers_are_millimetres(key, dtype):
     millimetres = np.array([0, 4, 5, 812], dtype=np.uint16)
-    made = in_metres(torch.from_numpy(millimetres).to(dtype))
+    made = metres(key, torch.from_numpy(millimetres).to(dtype))
     assert made.dtype == torch.float32
-    np.testing.assert_array_equal(made.numpy(), depth_in_metres(millimetres))
+    np.testing.assert_array_equal(made.numpy(), in_metres_offline(millimetres))
 
 
-@pytest.mark.parametrize("in_metres", [metres_of_depth, metres_of_heights])
-def test_no_values_have_no_unit(in_metres):
-    assert in_metres(torch.zeros(0, 1, 4, 4)).shape == (0, 1, 4, 4)
+@pytest.mark.parametrize("key", [DEPTH, HEIGHT])
+def test_empty_images_have_no_unit(key):
+    assert metres(key, torch.zeros(0, 1, 4, 4)).shape == (0, 1, 4, 4)
+
+
+def test_views_of_a_robot_without_gripper_state_are_not_clipped(observed):
+    step = ViewsProcessorStep(views=OPTIONS, gripper=[])
+    without = {key: value for key, value in observed.items() if key != keys.STATE}
+    made = step.observation(without)
+    unclipped = ViewsProcessorStep(views=[REPROJ | {"clip": "none"}]).observation(dict(observed))
+    assert torch.equal(made[keys.view("side", "reproj")], unclipped[keys.view("side", "reproj")])
+    assert keys.view("side", "persp") in made
+    assert keys.view("side", "persp_gripper") not in made
 
 
 def test_integer_depth_of_a_camera_is_reprojected(observed):
     """As `prepare_observation_for_inference` hands over a RealSense's."""
     key = keys.depth("side")
     millimetres = (observed[key] * 1000).round()
-    step = ViewsProcessorStep(views={"reproj": OPTIONS["reproj"]})
+    step = ViewsProcessorStep(views=[REPROJ])
     made, expected = (
-        step.observation(observed | {key: depth}) for depth in (millimetres.to(torch.uint16), millimetres / 1000)
+        step.observation(observed | {key: depth})
+        for depth in (millimetres.to(torch.uint16), millimetres / torch.tensor(1000.0))
     )
     for output in make_view("reproj").outputs:
         assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
@@ -296,7 +351,7 @@ def test_an_observations_own_calibration_comes_first(observed):
 
 
 def test_images_of_another_size_than_calibrated_are_refused(observed):
-    step = ViewsProcessorStep(views={"persp": {}}, calibration=stated(observed))
+    step = ViewsProcessorStep(views=["persp"], calibration=stated(observed))
     small = {key: value[..., ::2, ::2] if "images" in key else value for key, value in observed.items()}
     with pytest.raises(CalibrationError, match="calibrated for 152 x 152 pixels, the observation has 76 x 76"):
         step.observation(without_calibration(small))

@@ -5,9 +5,10 @@ import pytest
 
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.errors import SymviewError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.runtime.cli import DatasetLocation
 from lerobot_symview.views import make_view
 from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
 from symview_eval.preview import PreviewConfig, preview, read_moments, table_resolution
@@ -16,7 +17,7 @@ from tests.helpers.datasets import views_config
 
 
 def config(source, folder, **options):
-    return PreviewConfig(DatasetTarget("test/shown", source), output_dir=folder, **({"rerun": False} | options))
+    return PreviewConfig(DatasetLocation("test/shown", source), output_dir=folder, **({"rerun": False} | options))
 
 
 def test_views_are_shown_before_they_are_added(recorded, tmp_path):
@@ -83,7 +84,7 @@ def test_what_is_too_little_is_said(recorded, tmp_path, caplog):
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"episodes": [7]}, CommandError, r"--episodes names \[7\], the dataset has 2 episodes"),
+        ({"episodes": [7]}, SymviewError, r"--episodes names \[7\], the dataset has 2 episodes"),
         ({"camera": "front", "views": ["persp"]}, ValueError, "no camera 'front'"),
     ],
 )
@@ -95,7 +96,7 @@ def test_a_mistake_is_named(recorded, tmp_path, options, error, message):
 @pytest.mark.parametrize(("option", "value"), [("frames", 0), ("episodes", []), ("max_holes", 2.0)])
 def test_impossible_options_are_refused(option, value):
     with pytest.raises(ValueError, match=f"--{option}"):
-        PreviewConfig(DatasetTarget("a/b"), **{option: value})
+        PreviewConfig(DatasetLocation("a/b"), **{option: value})
 
 
 def test_a_moment_is_read_from_its_row(recorded):

@@ -25,7 +25,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.nn.encoders.convolutional import ImageEncoder
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 
@@ -251,7 +251,7 @@ def _loading_seconds(config: PolicyBenchmark) -> float:
         generate(GenerateConfig(target, env=RecordedEnv(), num_episodes=LOADED_EPISODES))
         add_views(
             AddViewsConfig(
-                PushedDataset("benchmark/recorded", recorded),
+                HubDataset("benchmark/recorded", recorded),
                 new_repo_id="benchmark/views",
                 new_root=views,
                 size=config.crop_size + MARGIN,

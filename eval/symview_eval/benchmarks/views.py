@@ -20,11 +20,11 @@ import pyarrow.parquet as pq
 from lerobot_symview import keys
 from lerobot_symview.datasets import derivation
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.geometry.homography import image_from_topdown
-from lerobot_symview.views import Frame, make_view
+from lerobot_symview.views import Frame, ViewSpec, make_view
 from symview_eval.benchmarks.clock import Clock, seconds
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
@@ -195,9 +195,9 @@ def _offline(frames: int, rounds: int) -> dict[str, float]:
         def add(dataset: Path, num_workers: int = 1) -> float:
             target = folder / "views"
             config = AddViewsConfig(
-                PushedDataset("benchmark/source", dataset),
+                HubDataset("benchmark/source", dataset),
                 new_root=target,
-                views=["reproj", "persp"],
+                views=[ViewSpec("reproj"), ViewSpec("persp")],
                 num_workers=num_workers,
             )
             taken = seconds(lambda: add_views(config))

@@ -128,7 +128,7 @@ def _reinforce(job: Job, env: EnvSettings) -> list[Checkpoint]:
     config = TrainRlConfig(
         dataset=job.demonstrations,
         env=env,
-        policy=SymviewSacfdConfig(device=job.device, push_to_hub=False, **scale.policy, **cell.row.policy),
+        policy=SymviewSacfdConfig(device=job.device, push_to_hub=False, **scale.policy, **cell.row.policy_options),
         output_dir=job.output,
         steps=cell.steps,
         batch_size=scale.batch_size,

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.inputs.observation_codec import FrameCodec
+from lerobot_policy_symview.inputs.observation_codec import ObservationCodec
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.demonstrations import observations
 from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
@@ -49,7 +49,7 @@ class Demonstrations:
 
     def __init__(self, dataset: Any, actor: Actor):
         self._device = torch.device(actor.policy.config.device)
-        self._codec = FrameCodec(actor.policy.config)
+        self._codec = ObservationCodec(actor.policy.scene)
         frames, actions = [], []
         for observation, action in observations(dataset):
             frames += self._codec.pack(actor.preprocessor(observation))
@@ -114,7 +114,7 @@ def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
         push_to_hub=False,
         learning_rate_decay=cell.scale.learning_rate_decay,
         **cell.scale.policy,
-        **cell.row.policy,
+        **cell.row.policy_options,
     )
     config.limit_view()
     return config

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from lerobot_policy_symview.methods import METHODS
 from lerobot_symview.registry import lookup
+from lerobot_symview.views import ViewSpec
 from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 
@@ -31,6 +33,14 @@ class Row:
     """Settings of the policy: `method`, and what differs from it."""
     elevation_deg: float = ELEVATION
     """Of the camera, degrees above the table."""
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Constructor arguments of the policy's configuration: `view_options` are those of its method's view."""
+        options = {name: value for name, value in self.policy.items() if name != "view_options"}
+        if "view_options" in self.policy:
+            options["view"] = ViewSpec(METHODS[options["method"]]["view"], self.policy["view_options"])
+        return options
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.workspace import Workspace
 
 
@@ -25,9 +25,9 @@ class Cloud:
     color: Tensor
     valid: Tensor
 
-    def moved(self, motion: Motion) -> Cloud:
-        """Return the cloud of the scene moved about the workspace centre, one motion per scene."""
-        x, y = motion.move(self.position[..., 0], self.position[..., 1])
+    def transformed(self, transform: PlanarTransform) -> Cloud:
+        """Return the cloud of the transformed scenes, one transform per scene."""
+        x, y = transform.apply(self.position[..., 0], self.position[..., 1])
         return replace(self, position=torch.stack([x, y, self.position[..., 2]], dim=-1))
 
     def sample(self, count: int, shuffle: bool) -> Tensor:

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.state import StateInput
-from lerobot_policy_symview.nn.encoders.convolutional import make_encoder
+from lerobot_policy_symview.nn.encoders.registry import make_encoder
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, make_group
 
@@ -60,5 +60,5 @@ class Critic(nn.Module):
         super().__init__()
         group = make_group(config.group)
         self.encoder = make_encoder(config, group, inputs.representation(group))
-        actions = config.actions.representation(group, config.theta_representation)
+        actions = config.actions.matrices(group, config.theta_representation)
         self.values = DoubleQ(group, self.encoder.fields, actions)

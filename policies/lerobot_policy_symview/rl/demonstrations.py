@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from lerobot_symview import keys
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
+from lerobot_symview.runtime.cli import CommandError, DatasetLocation
 from lerobot_symview.runtime.staging import plain
 from symview_sim.settings import EnvSettings
 
@@ -22,7 +22,7 @@ BATCH = 32
 REWARD, SUCCESS = "next.reward", "next.success"
 
 
-def open_dataset(target: DatasetTarget) -> Any:
+def open_dataset(target: DatasetLocation) -> Any:
     """Return the `LeRobotDataset`, depth in metres.
 
     Raises:

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_policy_symview.inputs.observation_codec import FrameCodec
+from lerobot_policy_symview.inputs.observation_codec import ObservationCodec
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.nn.critic import Critic
 from lerobot_policy_symview.nn.layers import asymmetry
@@ -35,8 +35,8 @@ class Learner(nn.Module):
         super().__init__()
         config = policy.config
         device = policy.action_center.device
-        self.config, self.policy, self.codec = config, policy, FrameCodec(config)
-        self.critic = Critic(config, policy.inputs).to(device)
+        self.config, self.policy, self.codec = config, policy, ObservationCodec(policy.scene)
+        self.critic = Critic(config, policy.state_input).to(device)
         self.target = deepcopy(self.critic).requires_grad_(False)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(config.initial_temperature), device=device))
         trained = {"actor": policy.get_optim_params(), "critic": self.critic.parameters()}
@@ -114,10 +114,10 @@ class Learner(nn.Module):
         device = self.log_temperature.device
         frames = self.codec.unpack(sample.frames, device)
         action = sample.action.to(device)
-        motion = self.policy.random_motion(action)
+        motion = self.policy.random_transform(action)
         place = torch.rand(len(action), 2, device=device).repeat(2, 1)
         if motion is not None:
-            action = self.config.actions.move(action, motion, absolute_yaw=False).clamp(-1, 1)
+            action = self.config.actions.transform(action, motion, absolute_yaw=False).clamp(-1, 1)
             motion = motion.repeated(2)
         picture, state = self.policy.network_input(frames, motion, place)
         return tuple(zip(picture.chunk(2), state.chunk(2), strict=True)), action

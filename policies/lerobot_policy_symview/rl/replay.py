@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_policy_symview.inputs.observation_codec import Frame
+from lerobot_policy_symview.inputs.observation_codec import StoredObservation
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,9 @@ class Replay:
         folder: where frames are kept if they need more memory than allowed.
     """
 
-    def __init__(self, config: ReplayConfig, example: Frame, actions: int, lengths: Sequence[int], folder: Path):
+    def __init__(
+        self, config: ReplayConfig, example: StoredObservation, actions: int, lengths: Sequence[int], folder: Path
+    ):
         self.config = config
         self._first = np.concatenate([[0], np.cumsum(lengths)])
         self.slots = slots = int(self._first[-1])
@@ -118,12 +120,17 @@ class Replay:
         """Whether frames are kept in files."""
         return any(isinstance(array, np.memmap) for array in self._frames.values())
 
-    def begin(self, stream: int, frame: Frame) -> None:
+    def begin(self, stream: int, frame: StoredObservation) -> None:
         """Write what an episode begins with."""
         self._advance(stream, frame)
 
     def add(
-        self, stream: int, action: NDArray[np.float32], reward: float, terminal: bool, following: Frame | None
+        self,
+        stream: int,
+        action: NDArray[np.float32],
+        reward: float,
+        terminal: bool,
+        following: StoredObservation | None,
     ) -> None:
         """Complete the stream's newest slot.
 
@@ -203,7 +210,7 @@ class Replay:
                 array[first : first + count] = saved[begin : begin + count]
                 begin += count
 
-    def _advance(self, stream: int, frame: Frame) -> None:
+    def _advance(self, stream: int, frame: StoredObservation) -> None:
         length = int(self._first[stream + 1] - self._first[stream])
         self._head[stream] = (self._head[stream] + 1) % length
         self._written[stream] = max(self._written[stream], self._head[stream] + 1)

@@ -14,9 +14,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_symview import keys
+from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.geometry.units import Unit
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observation, Observed, Reset, Simulators, Step
 
@@ -35,7 +38,7 @@ class Actor:
 
     def __init__(self, policy: SymviewPolicy):
         self.policy = policy
-        self.preprocessor, self.postprocessor = make_processors(policy.config)
+        self.preprocessor, self.postprocessor = make_processors(policy.config, depth_units=metric_depth(policy.config))
 
     def seen(self, observations: list[Observation]) -> dict[str, Tensor]:
         """Return B observations as the preprocessor leaves them."""
@@ -49,6 +52,12 @@ class Actor:
         """Return the actions (B, A), in metres and radians."""
         actions: Tensor = self.postprocessor(self.policy.select_action(self.seen(observations)))
         return actions.numpy()
+
+
+def metric_depth(config: SymviewConfig) -> dict[str, Unit]:
+    """Return the units of depth from simulators and from `open_dataset`: metres."""
+    depth = [keys.depth(config.camera), keys.depth("top"), config.height_key]
+    return {key: "m" for key in depth if key is not None}
 
 
 def _as_delivered(values: Tensor) -> Tensor:
@@ -76,8 +85,8 @@ def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
         )
     return Observed(
         env=env,
-        names=tuple(config.network_keys),
-        views=config.computed_views,
+        names=tuple(make_scene_input(config, parse_workspace(config.workspace)).keys),
+        views=tuple(config.views_to_make),
         camera=config.camera,
         workspace=config.workspace,
     )

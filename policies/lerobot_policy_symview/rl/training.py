@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_policy_symview.inputs.observation_codec import Frame
+from lerobot_policy_symview.inputs.observation_codec import StoredObservation
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl.demonstrations import check_scene, observations, outcomes, ranges
 from lerobot_policy_symview.rl.learner import Learner
@@ -218,7 +218,7 @@ class Training:
     def _remember_demonstrations(self) -> None:
         """Add what the expert did; actions beyond the simulator's limits are cut to them."""
         reward, ends, succeeds = outcomes(self._dataset)
-        frames: list[Frame] = []
+        frames: list[StoredObservation] = []
         actions = []
         for observation, action in tqdm(observations(self._dataset), desc="demonstrations", unit="batch", leave=False):
             frames += self.learner.codec.pack(self.actor.preprocessor(observation))
@@ -231,7 +231,7 @@ class Training:
             if not ends[i] or succeeds[i]:  # what followed the last frame of a failure is not known
                 self.replay.add(EXPERT, scaled[i], reward[i], bool(succeeds[i]), None if ends[i] else frames[i + 1])
 
-    def _pack(self, seen: Observation | None) -> Frame:
+    def _pack(self, seen: Observation | None) -> StoredObservation:
         assert seen is not None
         return self.learner.codec.pack(self.actor.seen([seen]))[0]
 

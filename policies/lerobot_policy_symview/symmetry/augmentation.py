@@ -1,4 +1,4 @@
-"""Transformations of images: moving scenes about the workspace centre, scaling and cropping."""
+"""Random planar transforms of scenes, and the images they transform: rotated, scaled and cropped."""
 
 from __future__ import annotations
 
@@ -8,40 +8,47 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 
 AUGMENTATIONS = {"d4": (4, True), "so2": (None, False), "o2": (None, True)}
+"""Name -> number of rotations (None: any angle) and whether reflections belong to it."""
 
 
-def random_motion(turns: int | None, mirrors: bool, like: Tensor) -> Motion:
-    """Draw one motion per sample of `like` (B, ...): by multiples of 360 degrees / `turns` or any, mirrored or not."""
+def random_transform(rotations: int | None, reflections: bool, like: Tensor) -> PlanarTransform:
+    """Draw one transform per sample of `like` (B, ...).
+
+    Args:
+        rotations: angles are multiples of 360 degrees / `rotations`; None draws any angle.
+        reflections: reflect half of the samples.
+        like: says how many samples there are, the device and the dtype.
+    """
     angle = torch.rand(len(like), device=like.device, dtype=like.dtype)
-    angle = 2 * math.pi * (angle if turns is None else (angle * turns).floor() / turns)
-    mirrored = torch.rand(len(like), device=like.device) < (0.5 if mirrors else 0.0)
-    return Motion(angle, mirrored)
+    angle = 2 * math.pi * (angle if rotations is None else (angle * rotations).floor() / rotations)
+    reflected = torch.rand(len(like), device=like.device) < (0.5 if reflections else 0.0)
+    return PlanarTransform(angle, reflected)
 
 
-def move_images(images: Tensor, motion: Motion) -> Tensor:
-    """Move the middle squares of images (B, C, H, W) as the scene moves; edges are extended.
+def transform_images(images: Tensor, transform: PlanarTransform) -> Tensor:
+    """Transform the central squares of top-down images (B, C, H, W) with the scene; borders are repeated outwards.
 
-    A quarter turn equals `torch.rot90(images, 1, (-2, -1))` and a mirror image `images.flip(-1)`, by DESIGN's pixel
-    convention: rows grow with x, columns with y. It is computed in the images' precision under autocast too.
+    A rotation by 90 degrees equals `torch.rot90(images, 1, (-2, -1))` and a reflection `images.flip(-1)`: rows grow
+    with x, columns with y. It is computed in the images' precision under autocast too.
 
     Returns:
         (B, C, S, S), S the shorter of H and W.
     """
-    images = crop(images, min(images.shape[-2:]))  # a turned oblong would be stretched to fit
-    cos, sin, sign = torch.cos(motion.angle), torch.sin(motion.angle), motion.sign
+    images = crop(images, min(images.shape[-2:]))  # a rotated oblong would be stretched to fit
+    cos, sin, det = torch.cos(transform.angle), torch.sin(transform.angle), transform.determinant
     zero = torch.zeros_like(cos)
-    # grid_sample asks where an output pixel (column, row) is read: at the inverse motion of its place (y, x)
-    theta = torch.stack([torch.stack([sign * cos, -sign * sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
-    with torch.autocast(images.device.type, enabled=False):  # its bfloat16 cannot tell a pixel from the next
+    # grid_sample reads an output pixel (column, row) at the inverse transform of its (y, x)
+    theta = torch.stack([torch.stack([det * cos, -det * sin, zero], -1), torch.stack([sin, cos, zero], -1)], dim=-2)
+    with torch.autocast(images.device.type, enabled=False):  # its bfloat16 cannot resolve a pixel
         grid = functional.affine_grid(theta, list(images.shape), align_corners=False)
         return functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 
 
 def scale_down(images: Tensor, size: int) -> Tensor:
-    """Average images (B, C, H, W) over areas so that their shorter side has `size` pixels; smaller ones stay."""
+    """Downscale images (B, C, H, W) by area averaging to a shorter side of `size` pixels; smaller images are kept."""
     height, width = images.shape[-2:]
     shorter = min(height, width)
     if shorter <= size:
@@ -49,19 +56,20 @@ def scale_down(images: Tensor, size: int) -> Tensor:
     return functional.interpolate(images, (height * size // shorter, width * size // shorter), mode="area")
 
 
-def crop(images: Tensor, size: int, place: Tensor | None = None) -> Tensor:
-    """Return size x size pixels of images (B, C, H, W).
+def crop(images: Tensor, size: int, offset: Tensor | None = None) -> Tensor:
+    """Crop images (B, C, H, W) to size x size pixels.
 
     Args:
-        images: at least that large.
-        size: pixels.
-        place: (B, 2) in [0, 1), which of the possible rows and columns each part begins at; by default the middle one.
+        images: at least `size` pixels high and wide.
+        size: rows and columns of the crop.
+        offset: (B, 2) in [0, 1), the crop offset of each image, row and column, relative to the largest; by default
+            the centre crop.
     """
     batch, channels, height, width = images.shape
-    if place is None:
+    if offset is None:
         top, left = (height - size) // 2, (width - size) // 2
         return images[..., top : top + size, left : left + size]
-    row, column = place.unbind(-1)
+    row, column = offset.unbind(-1)
     corner = torch.stack([row * (height - size + 1), column * (width - size + 1)], dim=-1).long()
     rows, columns = (corner[..., None] + torch.arange(size, device=corner.device)).unbind(dim=1)
     index = torch.arange(batch, device=corner.device)[:, None, None, None]

@@ -9,7 +9,7 @@ import torch
 from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.nn.encoders.point_cloud import farthest_points, neighborhoods
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.env import SymviewEnv
@@ -91,8 +91,8 @@ def test_voxels_hold_the_mean_colour_of_their_points(scene):
 
 def test_voxels_turn_with_the_scene(scene):
     cloud = make_cloud(scene)
-    quarter = Motion(torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([True]))
-    moved = voxelize(cloud.moved(quarter), WORKSPACE)
+    quarter = PlanarTransform(torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([True]))
+    moved = voxelize(cloud.transformed(quarter), WORKSPACE)
     torch.testing.assert_close(moved, torch.rot90(voxelize(cloud, WORKSPACE).flip(-1), 1, (-2, -1)))
 
 

@@ -7,9 +7,9 @@ import torch
 from lerobot_policy_symview.nn.encoders.convolutional import ImageEncoder
 from lerobot_policy_symview.nn.escnn_bridge import EscnnEncoder, load_from_escnn
 from lerobot_policy_symview.nn.layers import FieldConv2d, FieldConv3d, FieldLinear, RelaxedConv2d
-from lerobot_policy_symview.symmetry.augmentation import move_images
+from lerobot_policy_symview.symmetry.augmentation import transform_images
 from lerobot_policy_symview.symmetry.groups import block_diagonal, make_group
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 
 D4 = make_group("D4")
 
@@ -94,9 +94,9 @@ def test_turns_by_45_degrees_are_equivariant_up_to_interpolation(name):
     with torch.no_grad():
         expected = second(torch.relu(first(images)))
         for element in range(group.size):
-            motion = Motion.of_element(group, element, images.flatten(1))
-            moved = second(torch.relu(first(move_images(images, motion))))[middle]
-            difference = moved - move_images(move_fields(expected, group, element), motion)[middle]
+            motion = PlanarTransform.of_element(group, element, images.flatten(1))
+            moved = second(torch.relu(first(transform_images(images, motion))))[middle]
+            difference = moved - transform_images(move_fields(expected, group, element), motion)[middle]
             error = difference.abs().max() / expected[middle].abs().max()
             assert error < (1e-10 if element % 2 == 0 else 0.1)
             assert error > 1e-4 or element % 2 == 0

@@ -7,12 +7,17 @@ import pytest
 import torch
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
-from lerobot_policy_symview.equivariance import assert_equivariant, checked_group, equivariance_errors, move_observation
+from lerobot_policy_symview.equivariance import (
+    assert_equivariant,
+    checked_group,
+    equivariance_errors,
+    transform_observation,
+)
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import log_density
 from lerobot_policy_symview.rl.learner import MEASURES, Learner
 from lerobot_policy_symview.rl.replay import Sample
-from lerobot_policy_symview.symmetry.representations import Motion
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from tests.helpers.policies import make_actor, training_batch
 from tests.lerobot_policy_symview.test_equivariance import EQUIVARIANT
@@ -70,8 +75,10 @@ def test_the_actor_is_equivariant_and_the_critic_invariant_after_updates(method)
 
     expected = values(raw, action)
     for element in (1, group.turns, group.size - 1):  # a turn and a mirror image generate the rest
-        moved = move_observation(raw, config, group, element)
-        turned = config.actions.move(action, Motion.of_element(group, element, action), absolute_yaw=False)
+        moved = transform_observation(raw, config, group, element)
+        turned = config.actions.transform(
+            action, PlanarTransform.of_element(group, element, action), absolute_yaw=False
+        )
         torch.testing.assert_close(values(moved, turned), expected, rtol=1e-9, atol=1e-11)
         assert (values(moved, action) - expected).abs().max() > 1e-6
 
@@ -85,8 +92,8 @@ def test_the_whole_distribution_moves_with_the_scene():
     assert torch.equal(log_std[:, 0], log_std[:, 1])
     assert log_std[0].unique().numel() == 4
     for element in range(1, group.size):
-        moved = policy.network(*policy.network_input(move_observation(raw, config, group, element)))
-        turned = config.actions.move(mean, Motion.of_element(group, element, mean), absolute_yaw=False)
+        moved = policy.network(*policy.network_input(transform_observation(raw, config, group, element)))
+        turned = config.actions.transform(mean, PlanarTransform.of_element(group, element, mean), absolute_yaw=False)
         torch.testing.assert_close(moved[0], turned, rtol=1e-9, atol=1e-11)
         torch.testing.assert_close(moved[1], log_std, rtol=1e-9, atol=1e-11)
 

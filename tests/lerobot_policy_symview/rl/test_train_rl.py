@@ -25,8 +25,8 @@ from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
+from lerobot_symview.errors import SymviewError
 from lerobot_symview.geometry.placement import CameraSpec
-from lerobot_symview.runtime.cli import CommandError
 from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.helpers.training import train
 
@@ -92,7 +92,7 @@ def test_every_method_acts_and_learns_beside_simulators(method, recorded, tmp_pa
             training.joint_step()
         assert training.interval.updates == 3
         assert len(training.interval.success) == 2
-        assert set(training.replay._frames) == set(training.policy.config.network_keys)
+        assert set(training.replay._frames) == set(training.policy.scene.keys)
 
 
 def test_lerobot_train_fits_the_actor_to_demonstrations(recorded, tmp_path, monkeypatch):
@@ -253,14 +253,14 @@ def test_weights_and_biases_gets_the_tables_without_a_network(recorded, tmp_path
     ids=str,
 )
 def test_an_output_folder_that_does_not_fit_is_refused(recorded, whole, options, message):
-    with pytest.raises(CommandError, match=message):
+    with pytest.raises(SymviewError, match=message):
         train_rl(make_config(recorded, whole.parent.parent, **options))
 
 
 def test_nothing_to_resume_and_nothing_to_learn_from_are_told(recorded, tmp_path):
-    with pytest.raises(CommandError, match=r"no checkpoint in .* to resume from: leave out --resume=true"):
+    with pytest.raises(SymviewError, match=r"no checkpoint in .* to resume from: leave out --resume=true"):
         train_rl(make_config(recorded, tmp_path / "empty", resume=True))
-    with pytest.raises(CommandError, match=r"there is no dataset in .*--dataset.root"):
+    with pytest.raises(SymviewError, match=r"there is no dataset in .*--dataset.root"):
         train_rl(make_config(tmp_path / "nowhere", tmp_path / "empty"))
 
 

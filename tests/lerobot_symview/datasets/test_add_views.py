@@ -3,6 +3,7 @@ import shutil
 import sys
 from dataclasses import dataclass
 
+import draccus
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -11,16 +12,18 @@ from lerobot.scripts import lerobot_train
 
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.errors import DatasetError, SymviewError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.cli import CommandError, DatasetTarget
-from lerobot_symview.views import VIEWS, Frame, make_view
+from lerobot_symview.views import VIEWS, Frame, PerspectiveView, ReprojectedView, View, ViewSpec, make_view
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
-from tests.helpers.datasets import contents, images_of, views_config
+from tests.helpers.datasets import change_feature, contents, images_of, rewrite_depth, views_config
+from tests.helpers.packages import registered
 
 
 def parquet_columns(folder):
@@ -97,22 +100,22 @@ def test_keep_drops_the_other_images(only_views):
 
 def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, with_views):
     before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
-    with pytest.raises(CommandError, match="exists already"):
-        add_views(AddViewsConfig(PushedDataset("test/recorded", recorded), new_root=with_views))
+    with pytest.raises(SymviewError, match="exists already"):
+        add_views(AddViewsConfig(HubDataset("test/recorded", recorded), new_root=with_views))
     assert {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"camera": "wrist"}, ValueError, "calibrated cameras: .*side"),
+        ({"camera": "wrist"}, DatasetError, "--camera=wrist.* lacks .*cameras with calibration: side, top"),
         ({"keep": ["front"]}, ValueError, "--keep names .*front"),
-        ({"dataset": DatasetTarget("no/where")}, CommandError, "there is no dataset in"),
+        ({"dataset": HubDataset("no/where")}, DatasetError, "--dataset: there is no LeRobot dataset in"),
     ],
 )
 def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, options, error, message):
     target = tmp_path / "target"
-    config = AddViewsConfig(**({"dataset": PushedDataset("test/recorded", recorded), "new_root": target} | options))
+    config = AddViewsConfig(**({"dataset": HubDataset("test/recorded", recorded), "new_root": target} | options))
     with pytest.raises(error, match=message):
         add_views(config)
     assert list(tmp_path.iterdir()) == []
@@ -140,7 +143,7 @@ def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
     np.testing.assert_array_equal(images_of(only, key), images_of(folders[True], key))
     lost = next((source / "videos" / keys.depth("side")).rglob("*.mp4"))
     lost.unlink()
-    with pytest.raises(CommandError, match=rf"lacks videos/{keys.depth('side')}/.*file-000\.mp4: download or copy"):
+    with pytest.raises(SymviewError, match=rf"lacks videos/{keys.depth('side')}/.*file-000\.mp4: download or copy"):
         add_views(views_config(source, tmp_path / "never"))
     assert not (tmp_path / "never.partial").exists()
     add_views(views_config(source, tmp_path / "without_depth", views=["persp"], keep=[]))  # which that video is not for
@@ -149,13 +152,13 @@ def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
 @pytest.mark.parametrize("views", [[], ["reprojection"]])
 def test_unknown_views_are_refused_before_anything_is_read(views):
     with pytest.raises(ValueError, match=r"view"):
-        AddViewsConfig(PushedDataset("a/b"), views=views)
+        AddViewsConfig(HubDataset("a/b"), views=views)
 
 
 @pytest.mark.parametrize("name", ["views", "me/", "a/b/c"])
 def test_a_wrong_name_of_the_result_names_its_flag(name):
     with pytest.raises(ValueError, match=f"--new_repo_id must look like user/name, got '{name}'"):
-        AddViewsConfig(PushedDataset("a/b"), new_repo_id=name)
+        AddViewsConfig(HubDataset("a/b"), new_repo_id=name)
 
 
 @pytest.mark.parametrize("place", ["source/views", "source/meta/views", "source", ".", "link/views"])
@@ -198,16 +201,61 @@ def test_a_camera_may_be_kept_for_stock_policies(recorded, tmp_path):
     assert set(images) == {keys.rgb("side"), keys.view("side", "reproj")}
 
 
-def test_a_view_of_one_channel_is_refused_for_stock_policies(monkeypatch):
+def test_a_view_of_one_channel_is_refused_for_stock_policies():
     @dataclass(frozen=True)
-    class Metres:
+    class Metres(View):
         size: int = 8
         outputs = {"metres": "height"}  # noqa: RUF012
 
-    monkeypatch.setitem(VIEWS, "metres", Metres)
-    AddViewsConfig(PushedDataset("a/b"), views=["metres"])
-    with pytest.raises(ValueError, match="the view 'metres' has one in metres: take it out of --views"):
-        AddViewsConfig(PushedDataset("a/b"), views=["metres"], for_stock_policies=True)
+        def render(self, frame):
+            return {"metres": np.zeros((self.size, self.size), np.float32)}
+
+    with registered(VIEWS, "metres", Metres):
+        AddViewsConfig(HubDataset("a/b"), views=["metres"])
+        with pytest.raises(ValueError, match=r"--for_stock_policies=true .* the view makes metres, which has one"):
+            AddViewsConfig(HubDataset("a/b"), views=["metres"], for_stock_policies=True)
+
+
+def test_views_of_any_package_take_options_on_the_command_line(recorded, tmp_path):
+    """A view's own options come before `--size`, which comes before dotted flags."""
+    arguments = ["--dataset.repo_id=a/b", "--views=[reproj, {name: persp, plane_height: 0.025, size: 40}]", "--size=76"]
+    config = draccus.parse(AddViewsConfig, args=[*arguments, "--reproj.infill=local", "--persp.gripper=false"])
+    views = config.make_views()
+    assert views["reproj"] == ReprojectedView(size=76, infill="local")
+    assert views["persp"] == PerspectiveView(size=40, plane_height=0.025, gripper=False)
+    with pytest.raises(ValueError, match="the view 'persp' has no option plain_height; it has size, plane_height"):
+        AddViewsConfig(HubDataset("a/b"), views=[ViewSpec("persp", {"plain_height": 1})])
+
+
+def test_a_dataset_without_gripper_dimensions_gets_unclipped_views_without_gripper(recorded, tmp_path, caplog):
+    source = tmp_path / "joints"
+    shutil.copytree(recorded, source)
+    change_feature(source, keys.STATE, names=[f"joint_{i}" for i in range(5)])
+    result = add_views(views_config(source, tmp_path / "views"))
+    assert "made without clipping at the gripper" in caplog.text
+    features = SourceDataset(result).features
+    assert keys.view("side", "persp_gripper") not in features
+    assert features[keys.view("side", "reproj")]["info"]["symview"]["options"]["clip"] == "none"
+    expected = add_views(
+        views_config(recorded, tmp_path / "unclipped", reproj=ReprojectedView(clip="none"), views=["reproj"])
+    )
+    key = keys.view("side", "reproj")
+    np.testing.assert_array_equal(images_of(result, key), images_of(expected, key))
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_depth_in_float_millimetres_gives_the_same_views(recorded, tmp_path, declared, caplog):
+    """A unit that is not declared is inferred once for the dataset, and logged."""
+    caplog.set_level("INFO")
+    source, key = tmp_path / "millimetres", keys.depth("side")
+    shutil.copytree(recorded, source)
+    rewrite_depth(source, key, lambda depth: depth * np.float32(1000))
+    change_feature(source, key, info={"is_depth_map": True} | ({"depth_unit": "mm"} if declared else {}))
+    result = add_views(views_config(source, tmp_path / "views", views=["reproj"]))
+    assert (f"{key} declares no depth_unit: its values are taken to be millimetres" in caplog.text) != declared
+    view = keys.view("side", "reproj_height")
+    expected = add_views(views_config(recorded, tmp_path / "expected", views=["reproj"]))
+    np.testing.assert_allclose(images_of(result, view), images_of(expected, view), atol=1e-5)
 
 
 @pytest.mark.parametrize("file", ["meta/stats.json", "data/chunk-000/file-000.parquet"])
@@ -215,6 +263,6 @@ def test_a_file_that_the_source_lacks_is_named_before_any_work(recorded, tmp_pat
     source = tmp_path / "source"
     shutil.copytree(recorded, source)
     (source / file).unlink()
-    with pytest.raises(CommandError, match=rf"dataset in .* lacks {file}: download or copy it again"):
+    with pytest.raises(SymviewError, match=rf"dataset in .* lacks {file}: download or copy it again"):
         add_views(views_config(source, tmp_path / "never"))
     assert list(tmp_path.iterdir()) == [source]

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import asdict
 
 import numpy as np
 import pyarrow as pa
@@ -24,10 +25,12 @@ from lerobot_symview.calibration.file import (
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.features import camera_features
 from lerobot_symview.datasets.source import vectors
-from lerobot_symview.geometry.camera import CalibrationError, Camera, intrinsics_from_fov, orbit_pose, stored_camera
+from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose, stored_camera
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import VIEWS, Frame, make_view
+from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
@@ -43,7 +46,9 @@ def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
     calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
     matrices = {key: source[0][key].tolist() for key in calibrations}
     modify_features(source, remove_features=calibrations, output_dir=tmp_path / "bare", repo_id="test/bare")
-    with pytest.raises(ValueError, match=r"lacks observation\.camera.*calibrated cameras: none, see --calibration"):
+    with pytest.raises(
+        DatasetError, match=r"--calibration: .*lacks observation\.camera.*cameras with calibration: none"
+    ):
         add_views(views_config(tmp_path / "bare", tmp_path / "never"))
     side = {"height": 152, "width": 152, "intrinsics": np.reshape(matrices[keys.intrinsics("side")], (3, 3)).tolist()}
     side["world_from_cam"] = np.reshape(matrices[keys.world_from_cam("side")], (4, 4)).tolist()
@@ -180,8 +185,11 @@ def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_s
     depth = record_real_robot(tmp_path / "real", camera, rgb)
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(plain_calibration(Calibration({"front": camera}))))
-    options = {"reproj": {"size": VIEW_SIZE, "clip": "none"}, "persp": {"size": VIEW_SIZE, "gripper": False}}
-    views = {name: make_view(name, **chosen) for name, chosen in options.items()}
+    views = {
+        "reproj": make_view("reproj", size=VIEW_SIZE, clip="none"),
+        "persp": make_view("persp", size=VIEW_SIZE, gripper=False),
+    }
+    specs = [ViewSpec(name, asdict(view)).plain() for name, view in views.items()]
     made = add_views(
         views_config(tmp_path / "real", tmp_path / "derived", camera="front", calibration=file, size=None, **views)
     )
@@ -191,8 +199,10 @@ def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_s
         keys.rgb("front"): torch.from_numpy(rgb).permute(2, 0, 1)[None],
         keys.depth("front"): torch.from_numpy(depth).permute(2, 0, 1)[None],
     }
-    online = ViewsProcessorStep(options, "front", calibration=plain_calibration(read_calibration(file)))
-    recomputed = Frame(rgb, depth[..., 0], stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace())
+    online = ViewsProcessorStep(specs, "front", calibration=plain_calibration(read_calibration(file)))
+    recomputed = Frame(
+        rgb, in_metres(depth[..., 0]), stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace()
+    )
     for observation in (dict(observed), observed | matrices):
         images = online.observation(observation)
         for view in views.values():
@@ -201,18 +211,6 @@ def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_s
                 again = again.transpose(2, 0, 1) / np.float32(255) if again.ndim == 3 else again[None]
                 np.testing.assert_array_equal(images[key][0].numpy(), item[key].numpy(), err_msg=key)
                 np.testing.assert_array_equal(again, item[key].numpy(), err_msg=key)
-
-
-def test_without_the_grippers_pose_the_flags_that_do_without_are_named(recorded, tmp_path):
-    source = tmp_path / "joints"
-    shutil.copytree(recorded, source)
-    info = json.loads((source / "meta" / "info.json").read_text())
-    info["features"][keys.STATE]["names"] = [f"joint_{i}" for i in range(5)]
-    (source / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(ValueError, match=r"x, y, z, yaw, aperture among the names.*--reproj\.clip.*--persp\.gripper"):
-        add_views(views_config(source, tmp_path / "derived"))
-    options = {"reproj": make_view("reproj", clip=0.2), "persp": make_view("persp", gripper=False)}
-    add_views(views_config(source, tmp_path / "derived", **options))
 
 
 def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
@@ -234,7 +232,8 @@ def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}))))
     with pytest.raises(
-        CalibrationError, match=r"'side' sees 0% of the workspace, .*check the poses in .*cameras\.json"
+        CalibrationError,
+        match=r"--calibration=.*cameras\.json: camera 'side' sees 0% of the workspace, .*check the poses",
     ):
         add_views(views_config(recorded, tmp_path / "derived", calibration=file))
     assert list(tmp_path.iterdir()) == [file]
@@ -243,7 +242,7 @@ def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
 def test_a_recorded_camera_that_sees_too_little_is_warned_of(recorded, tmp_path, caplog):
     with caplog.at_level("WARNING", logger="lerobot_symview.datasets.add_views"):
         add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
-    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty where it sees none", caplog.text)
+    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty where it sees nothing", caplog.text)
 
 
 def test_the_workspace_is_the_flags_then_the_files_then_the_datasets(recorded, tmp_path):

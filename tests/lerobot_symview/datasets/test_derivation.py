@@ -88,7 +88,7 @@ FORKING = f"""
 import os, pathlib, sys
 import cv2, datasets
 from lerobot_symview.datasets import add_views, derivation
-from lerobot_symview.datasets.hub import PushedDataset
+from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.views import *
 from tests.helpers.cameras import make_frame
 cv2.setNumThreads(0)  # threads do not survive a fork
@@ -100,7 +100,7 @@ for _ in sys.stdin:
     if child == 0:
         derivation.PART_FRAMES = 1
         add_views.add_views(add_views.AddViewsConfig(
-            PushedDataset('test/recorded', source), new_repo_id='test/derived', new_root=target,
+            HubDataset('test/recorded', source), new_repo_id='test/derived', new_root=target,
             views=['reproj', 'persp'], size={VIEW_SIZE}, resume=True))
         os._exit(0)
     print(child, flush=True)

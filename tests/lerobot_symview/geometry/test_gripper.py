@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lerobot_symview.geometry.gripper import GripperShape, gripper_image, gripper_picture
+from lerobot_symview.geometry.gripper import GripperShape, gripper_image, gripper_image_uint8
 from lerobot_symview.geometry.workspace import Workspace
 
 STATE = np.array([0.06, -0.03, 0.1, 0.4, 0.7])
@@ -63,5 +63,5 @@ def test_the_picture_is_the_image_in_grey_levels(x, y, z, yaw, aperture):
     state = np.array([x, y, z, yaw, aperture])
     image = gripper_image(state, Workspace(), 76)
     np.testing.assert_array_equal(
-        gripper_picture(state, Workspace(), 76), np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+        gripper_image_uint8(state, Workspace(), 76), np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
     )

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from lerobot_symview.geometry.camera import CalibrationError, Camera, project, stored_camera
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera, project, stored_camera
 from lerobot_symview.geometry.homography import camera_direction, image_from_topdown, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
 from tests.helpers.cameras import cameras, make_camera, moved, moved_picture, world_motion

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from lerobot_symview.geometry.camera import CalibrationError, project
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import project
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread, top_camera
 
 SPREAD = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0, distance=0.1, target=0.03)

@@ -6,7 +6,7 @@ import pytest
 
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import VIEWS, Frame, make_view, register_view
+from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view, make_views, register_view, reproject, warp_table
 from lerobot_symview.views.reprojection import INFILLS
 from tests.helpers.cameras import make_camera, make_frame, plane_depth
 
@@ -28,7 +28,7 @@ def turned(frame, quarter_turns):
     return Frame(frame.rgb, frame.depth, camera, frame.workspace, gripper)
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", list(VIEWS))
 def test_outputs_have_the_declared_kinds_and_size(name):
     view = make_view(name, size=SIZE)
     images = view.render(make_frame())
@@ -38,7 +38,7 @@ def test_outputs_have_the_declared_kinds_and_size(name):
         assert images[output].dtype == (np.uint8 if kind == "rgb" else np.float32)
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", list(VIEWS))
 def test_a_view_is_a_pure_function(name):
     frame = make_frame()
     before = frame.rgb.copy(), frame.depth.copy()
@@ -149,7 +149,7 @@ def test_impossible_options_are_refused(name, options):
         make_view(name, **options)
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", list(VIEWS))
 def test_every_combination_of_outputs_is_what_is_declared(name):
     switches = [field.name for field in fields(VIEWS[name]) if isinstance(field.default, bool)]
     for values in product([False, True], repeat=len(switches)):
@@ -157,15 +157,84 @@ def test_every_combination_of_outputs_is_what_is_declared(name):
         assert list(view.render(make_frame())) == list(view.outputs)
 
 
-@pytest.mark.parametrize("name", VIEWS)
-def test_a_view_that_needs_no_gripper_does_without(name):
-    options = {"reproj": {"clip": "none"}, "persp": {"gripper": False}}[name]
-    view = make_view(name, size=SIZE, **options)
-    assert not view.needs_gripper
-    view.render(replace(make_frame(), gripper=None))
-    assert make_view(name).needs_gripper
-    with pytest.raises(ValueError, match="gripper"):
-        make_view(name, size=SIZE).render(replace(make_frame(), gripper=None))
+@pytest.mark.parametrize("name", list(VIEWS))
+def test_without_the_grippers_state_nothing_is_clipped_and_no_gripper_drawn(name):
+    view = make_view(name, size=SIZE)
+    assert view.uses_gripper
+    without = view.without_gripper()
+    assert not without.uses_gripper
+    frame = make_frame()
+    expected = without.render(frame)
+    assert list(expected) == list(without.outputs)
+    for images in (view.render(replace(frame, gripper=None)), without.render(replace(frame, gripper=None))):
+        assert images.keys() == expected.keys()
+        for output, image in images.items():
+            np.testing.assert_array_equal(image, expected[output])
+
+
+def test_a_plane_that_follows_the_gripper_needs_its_state():
+    view = make_view("persp", size=SIZE, plane_height="gripper")
+    with pytest.raises(ValueError, match="plane_height=gripper needs the gripper's state"):
+        view.render(replace(make_frame(), gripper=None))
+    with pytest.raises(ValueError, match="plane_height=gripper needs the gripper's state"):
+        view.without_gripper()
+
+
+@pytest.mark.parametrize("gripper", [None, (0.05, -0.08, 0.2, 0.3, 0.8)])
+def test_the_functions_render_what_the_views_do(gripper):
+    frame = replace(make_frame(), gripper=None if gripper is None else np.array(gripper))
+    top = reproject(frame.rgb, frame.depth, frame.camera, frame.workspace, frame.gripper, size=SIZE)
+    images = make_view("reproj", size=SIZE, mask=True).render(frame)
+    np.testing.assert_array_equal(top.rgb, images["reproj"])
+    np.testing.assert_array_equal(top.height, images["reproj_height"])
+    np.testing.assert_array_equal(top.seen, images["reproj_seen"][..., 0] == 255)
+    warped = warp_table(frame.rgb, frame.camera, frame.workspace, size=SIZE, plane_height=0.03)
+    expected = make_view("persp", size=SIZE, plane_height=0.03, gripper=False).render(frame)["persp"]
+    np.testing.assert_array_equal(warped, expected)
+
+
+def test_integer_depth_is_millimetres():
+    frame = make_frame()
+    millimetres = np.rint(1000 * frame.depth).astype(np.uint16)
+    views = [
+        reproject(frame.rgb, depth, frame.camera, frame.workspace, size=SIZE)
+        for depth in (millimetres, millimetres.astype(np.float32) / np.float32(1000))
+    ]
+    np.testing.assert_array_equal(views[0].height, views[1].height)
+
+
+def test_an_unknown_option_names_the_known():
+    frame = make_frame()
+    with pytest.raises(ValueError, match="the view 'reproj' has no option infil; it has size, infill"):
+        reproject(frame.rgb, frame.depth, frame.camera, frame.workspace, infil="none")
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ("reproj", ViewSpec("reproj")),
+        ({"name": "persp", "plane_height": 0.025}, ViewSpec("persp", {"plane_height": 0.025})),
+        (ViewSpec("persp"), ViewSpec("persp")),
+    ],
+)
+def test_a_view_is_specified_by_name_or_mapping(entry, expected):
+    assert ViewSpec.parse(entry) == expected
+    assert ViewSpec.parse(expected.plain()) == expected
+
+
+@pytest.mark.parametrize("entry", [3, None, {}, {"plane_height": 0.025}, {"name": 3}])
+def test_what_specifies_no_view_is_refused(entry):
+    with pytest.raises(ValueError, match="a view is a name or a mapping with a name and options"):
+        ViewSpec.parse(entry)
+
+
+@pytest.mark.parametrize(
+    ("specs", "message"),
+    [([], "name at least one view"), ([ViewSpec("persp"), ViewSpec("persp")], "the view 'persp' is named twice")],
+)
+def test_lists_of_views_name_each_once(specs, message):
+    with pytest.raises(ValueError, match=message):
+        make_views(specs)
 
 
 def test_a_fixed_height_cuts_wherever_the_gripper_is():

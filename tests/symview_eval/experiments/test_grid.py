@@ -30,7 +30,7 @@ def test_every_row_is_a_policy(name, scale):
         assert policy.method == row.policy["method"]
         assert policy.crop_size == scale.crop_size
         if policy.is_computed and cell.algorithm == "bc":
-            (options,) = policy.computed_views.values()
+            options = policy.views_to_make[0].options
             assert options["size"] == policy.image_size
             assert row.policy.get("view_options", {}).items() <= options.items()
 

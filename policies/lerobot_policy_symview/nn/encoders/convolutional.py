@@ -16,11 +16,9 @@ from torch.nn import functional
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.voxels import VOXEL_CHANNELS
 from lerobot_policy_symview.nn.encoders.base import Encoder
-from lerobot_policy_symview.nn.encoders.point_cloud import PointEncoder
 from lerobot_policy_symview.nn.fourier_conv import FourierConv2d
 from lerobot_policy_symview.nn.layers import FieldConv2d, FieldConv3d, RelaxedConv2d
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
-from lerobot_symview.registry import added
 
 CHANNELS_LAST = {2: torch.channels_last, 3: torch.channels_last_3d}
 Convolution = Callable[[PlanarGroup, int | NDArray[np.float64], int, int], nn.Module]
@@ -119,41 +117,25 @@ def _full(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, pa
     return FieldConv2d(group, inputs, fields, padding, full=True)
 
 
-def _equivariant(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def equivariant(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the equivariant image encoder."""
     fields = (2 * config.width, config.width, config.width)
     return ImageEncoder(group, config.channels, state, _stages(config), fields, FourierConv2d)
 
 
-def _relaxed(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def relaxed(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the image encoder of relaxed group convolutions."""
     fields = (2 * config.width, config.width, config.width)
     return ImageEncoder(group, config.channels, state, _stages(config), fields, RelaxedConv2d)
 
 
-def _plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+def plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     """Return the lineage's 16, 32, 64, 128, 128, 256, 256 channels at the paper's size: 1.13 M parameters."""
     stages = [2 * fields for fields in _stages(config)]
     fields = (2 * config.width, 4 * config.width, 4 * config.width)
     return ImageEncoder(group, config.channels, state, stages, fields, _full)
 
 
-ENCODERS: dict[str, Callable[[SymviewConfig, PlanarGroup, NDArray[np.float64]], Encoder]] = {
-    "equivariant": _equivariant,
-    "plain": _plain,
-    "relaxed": _relaxed,
-    "voxel": lambda config, group, state: VoxelEncoder(group, state, config.width),
-    "point_cloud": lambda config, group, state: PointEncoder(group, state, config.width),
-}
-
-
-def make_encoder(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the encoder that a configuration names, one of ours or an entry point of the group `symview.encoders`.
-
-    Args:
-        config: the policy's.
-        group: of G elements.
-        state: how the numbers beside the picture move, (G, D, D).
-    """
-    if config.encoder in ENCODERS:
-        return ENCODERS[config.encoder](config, group, state)
-    encoder: Encoder = added("symview.encoders")[config.encoder].load()(config, group, state)
-    return encoder
+def voxel(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder of voxels."""
+    return VoxelEncoder(group, state, config.width)

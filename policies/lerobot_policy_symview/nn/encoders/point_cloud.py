@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
@@ -146,3 +147,8 @@ def _rows(values: Tensor, index: Tensor) -> Tensor:
     """Return values (B, P, F) at index (B, ...): (B, ..., F)."""
     flat = index.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
     return values.gather(1, flat).view(*index.shape, values.shape[-1])
+
+
+def point_cloud(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder of point clouds."""
+    return PointEncoder(group, state, config.width)

@@ -1,0 +1,97 @@
+"""What a policy reads from a dataset's features: its inputs, the view's options, the workspace and the calibration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lerobot.configs.types import FeatureType, PolicyFeature
+
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.views import View, ViewSpec
+
+Features = dict[str, dict[str, Any]]
+
+
+def read_features(config: SymviewConfig, features: Features) -> None:
+    """Set a configuration's inputs, outputs, view options, workspace and calibration from a dataset's features.
+
+    LeRobot accepts no visual feature at evaluation that was not declared in training, so the camera's raw images are
+    declared even where training reads only views made from them.
+
+    Raises:
+        ValueError: if the dataset lacks what the policy needs, or contradicts its declarations.
+    """
+    _check_vectors(config, features)
+    _read_view(config, features)
+    has_raw = all(key in features for key in config.raw_keys)
+    if not has_raw and config.color_key not in features:
+        raise ValueError(
+            f"--policy.view={config.view.name} needs {config.raw_keys} or {config.color_key!r}; "
+            f"the dataset has {sorted(key for key in features if 'images' in key)}"
+        )
+    _check_size(config, features)
+    visuals = list(config.raw_keys)
+    if not has_raw:
+        visuals += [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
+    config.input_features = {
+        keys.STATE: PolicyFeature(FeatureType.STATE, tuple(features[keys.STATE]["shape"])),
+        **{key: PolicyFeature(FeatureType.VISUAL, _channel_first(features, key)) for key in visuals},
+    }
+    config.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, tuple(features[keys.ACTION]["shape"]))}
+
+
+def _check_vectors(config: SymviewConfig, features: Features) -> None:
+    for representation, key in ((config.states, keys.STATE), (config.actions, keys.ACTION)):
+        if key not in features:
+            raise ValueError(f"the dataset lacks {key!r}, which the policy needs; it has {sorted(features)}")
+        names = features[key].get("names")
+        are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        size = int(features[key]["shape"][0])
+        representation.check(size, key, names if are_names and config.group != "C1" else None)
+
+
+def _read_view(config: SymviewConfig, features: Features) -> None:
+    """Take over how the dataset's view was made; else the workspace of the camera's image."""
+    stored = features.get(config.color_key, {}).get("info") or {}
+    if config.is_computed and "symview" in stored:
+        try:
+            config.view = ViewSpec(config.view.name, stored["symview"]["options"])
+            config.workspace = dict(stored["symview"]["workspace"])
+            config.calibration = dict(stored["symview"].get("calibration", config.calibration))
+            config.make_view()
+            parse_workspace(config.workspace)
+            if config.calibration:
+                parse_calibration(config.calibration)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"the dataset does not say how {config.color_key} was made: {error}") from None
+    else:
+        raw = features.get(config.raw_keys[0], {}).get("info") or {}
+        config.workspace = dict(raw.get("symview", {}).get("workspace", config.workspace))
+        if config.is_computed and not set(keys.STATE_NAMES) <= set(config.state_symmetry):
+            changed = _changed_options(config.make_view(), config.make_view().without_gripper())
+            config.view = ViewSpec(config.view.name, config.view.options | changed)
+
+
+def _changed_options(view: View, other: View) -> dict[str, Any]:
+    """Return the options in which `other` differs from `view`."""
+    return {name: getattr(other, name) for name in vars(other) if getattr(other, name) != getattr(view, name)}
+
+
+def _check_size(config: SymviewConfig, features: Features) -> None:
+    is_recorded = config.color_key in features
+    size = min(features[config.color_key]["shape"][:2]) if is_recorded else config.make_view().size
+    if size < config.crop_size and not config.sees_points:
+        raise ValueError(
+            f"--policy.crop_size={config.crop_size} is larger than the {size} px of the shorter side of "
+            f"{config.color_key!r}: lower it or make larger views"
+        )
+
+
+def _channel_first(features: Features, key: str) -> tuple[int, ...]:
+    """Return the shape (C, H, W) of an image feature; (C, 0, 0) for a raw image that the dataset left out."""
+    if key not in features:
+        return (1 if key.endswith("_depth") else 3, 0, 0)
+    height, width, channels = features[key]["shape"]
+    return (channels, height, width)

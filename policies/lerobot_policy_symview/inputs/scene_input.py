@@ -1,0 +1,191 @@
+"""The one place that forms what the network sees of a scene: top-down or camera images, or points in space.
+
+`make_scene_input` chooses the strategy once, from the configuration. Everything it does commutes with the network's
+group: the centre crop, the drawn gripper, the lifting of pixels to points.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.inputs.clouds import cloud_from_depth
+from lerobot_policy_symview.inputs.state import camera_directions
+from lerobot_policy_symview.inputs.voxels import voxelize
+from lerobot_policy_symview.nn.encoders.point_cloud import POINTS
+from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import parse_calibration
+from lerobot_symview.geometry.gripper import gripper_image
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views import ReprojectedView
+
+
+class SceneInput(ABC):
+    """Forms a network's input from preprocessed observations.
+
+    Args:
+        config: the policy's.
+        workspace: the square on the table that the network sees.
+    """
+
+    def __init__(self, config: SymviewConfig, workspace: Workspace):
+        self.config, self.workspace = config, workspace
+        calibration = parse_calibration(config.calibration) if config.calibration else None
+        self._fixed_camera = calibration.camera(config.camera) if calibration else None
+
+    @property
+    @abstractmethod
+    def keys(self) -> list[str]:
+        """Features of a preprocessed observation that it reads."""
+
+    @abstractmethod
+    def form(
+        self,
+        batch: dict[str, Tensor],
+        transform: PlanarTransform | None = None,
+        crop_offset: Tensor | None = None,
+        *,
+        shuffle: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the observation and the state (B, N) of the scene.
+
+        Args:
+            batch: preprocessed observations, colour in [0, 1], depth in metres.
+            transform: of the scene before it is seen; by default none.
+            crop_offset: (B, 2) in [0, 1), row and column relative to the largest offset; by default the centre crop.
+            shuffle: sample points at random.
+        """
+
+    def downscale(self, images: Tensor) -> Tensor:
+        """Reduce images (B, C, H, W) to the resolution that is needed; by default they are kept unchanged."""
+        return images
+
+    def camera_direction(self, batch: dict[str, Tensor], transform: PlanarTransform | None = None) -> Tensor | None:
+        """Return unit vectors (B, 2) from the workspace centre to the camera, None unless the network gets them."""
+        if not self.config.camera_direction:
+            return None
+        direction = camera_directions(self._calibration(batch)[1], self.workspace)
+        return direction if transform is None else torch.stack(transform.apply(*direction.unbind(-1)), dim=-1)
+
+    def _state(self, batch: dict[str, Tensor], transform: PlanarTransform | None) -> Tensor:
+        state = batch[keys.STATE]
+        return state if transform is None else self.config.states.transform(state, transform, absolute_yaw=True)
+
+    def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """K (B, 9) and pose (B, 16) of the camera: the observation's, or the configuration's where it has none."""
+        names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
+        if all(name in batch for name in names):
+            return batch[names[0]], batch[names[1]]
+        if self._fixed_camera is None:
+            raise KeyError(f"the method {self.config.method!r} needs {names}, the observation has {sorted(batch)}")
+        state, camera = batch[keys.STATE], self._fixed_camera
+        k, pose = (
+            torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
+            for matrix in (camera.intrinsics, camera.world_from_cam)
+        )
+        return k, pose
+
+
+class ImageInput(SceneInput):
+    """Images (B, C, crop, crop): colour in [0, 1], height for `rgbd`, the drawn gripper for `gripper_input=image`."""
+
+    @property
+    def keys(self) -> list[str]:
+        """The view's colour and height, the state, and the camera's calibration where it is used."""
+        config = self.config
+        found = [config.color_key, keys.STATE]
+        if config.modality == "rgbd":
+            assert config.height_key is not None
+            found.append(config.height_key)
+        if config.camera_direction:
+            found += [keys.intrinsics(config.camera), keys.world_from_cam(config.camera)]
+        if config.view.name == "top" and config.modality == "rgbd":
+            found.append(keys.world_from_cam("top"))
+        return found
+
+    def form(
+        self,
+        batch: dict[str, Tensor],
+        transform: PlanarTransform | None = None,
+        crop_offset: Tensor | None = None,
+        *,
+        shuffle: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Return images (B, C, crop, crop) and states (B, N)."""
+        images, state = self._images(batch), self._state(batch, transform)
+        if transform is not None:
+            images = transform_images(images, transform)
+        if self.config.gripper_input == "image":
+            images = torch.cat([images, self._gripper(state, images.shape[-1])[:, None]], dim=1)
+        return crop(images, self.config.crop_size, crop_offset), state
+
+    def downscale(self, images: Tensor) -> Tensor:
+        """Average images down to the size from which crops are taken."""
+        return scale_down(images, self.config.image_size)
+
+    def _images(self, batch: dict[str, Tensor]) -> Tensor:
+        """Colour in [0, 1] and, for `rgbd`, height relative to the working volume (a side camera's depth in metres)."""
+        color = batch[self.config.color_key]
+        if self.config.modality == "rgb":
+            return self.downscale(color)
+        assert self.config.height_key is not None
+        height = batch[self.config.height_key]
+        if self.config.view.name == "top":  # from straight above, depth is the camera's height less the surface's
+            camera_height = batch[keys.world_from_cam("top")].reshape(-1, 4, 4)[:, 2, 3]
+            height = camera_height[:, None, None, None] - height
+        if self.config.view.name != "side":
+            height = height / self.workspace.height_limit
+        return self.downscale(torch.cat([color, height], dim=1))
+
+    def _gripper(self, state: Tensor, pixels: int) -> Tensor:
+        """Draw the gripper (B, pixels, pixels)."""
+        pose = [state[:, self.config.state_symmetry.index(label)] for label in keys.STATE_NAMES]
+        drawn: Tensor = gripper_image(torch.stack(pose, dim=-1), self.workspace, pixels)
+        return drawn
+
+
+class PointInput(SceneInput):
+    """The camera's RGBD image lifted to space: voxels (B, 4, Z, X, Y) or points (B, P, 6)."""
+
+    @property
+    def keys(self) -> list[str]:
+        """The camera's colour, depth and calibration, and the state."""
+        camera = self.config.camera
+        return [
+            keys.rgb(camera), keys.STATE, keys.depth(camera), keys.intrinsics(camera), keys.world_from_cam(camera)
+        ]  # fmt: skip
+
+    def form(
+        self,
+        batch: dict[str, Tensor],
+        transform: PlanarTransform | None = None,
+        crop_offset: Tensor | None = None,
+        *,
+        shuffle: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Return voxels (B, 4, Z, X, Y) or points (B, P, 6) and states (B, N); points are not cropped."""
+        camera, clipping = self.config.camera, ReprojectedView()
+        state, dimensions = batch[keys.STATE], self.config.state_symmetry
+        z = state[:, dimensions.index("z")] if "z" in dimensions else state.new_full((len(state),), torch.inf)
+        cloud = cloud_from_depth(
+            batch[keys.rgb(camera)],
+            batch[keys.depth(camera)],
+            *self._calibration(batch),
+            self.workspace,
+            (z - clipping.clip_margin).clamp(min=clipping.clip_floor),
+        )
+        if transform is not None:
+            cloud = cloud.transformed(transform)
+        is_voxel = self.config.encoder == "voxel"
+        observation = voxelize(cloud, self.workspace) if is_voxel else cloud.sample(POINTS, shuffle=shuffle)
+        return observation, self._state(batch, transform)
+
+
+def make_scene_input(config: SymviewConfig, workspace: Workspace) -> SceneInput:
+    """Return the input of a policy: points for the encoders of points, else images."""
+    return (PointInput if config.sees_points else ImageInput)(config, workspace)
