@@ -7,20 +7,20 @@ The commands know the task once a package of yours has its name as an entry poin
 
 import argparse
 import logging
-from importlib.metadata import EntryPoint
 
 import numpy as np
 
-from lerobot_symview.registry import added
 from symview_sim.demonstration import demonstrate
 from symview_sim.grasping import CLEARANCE, carry, grasp
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
+from symview_sim.tasks import register_task
 from symview_sim.tasks.base import Task
 
 EDGE, NEAR = 0.05, 0.02  # metres
 
 
+@register_task("centring")
 class BlockCentring(Task):
     """A green block lies around a blue mark; solved when it stands on the mark, let go."""
 
@@ -55,6 +55,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=20)
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    added("symview.tasks")["centring"] = EntryPoint("centring", f"{__name__}:BlockCentring", "symview.tasks")
     tried = [demonstrate(EnvSettings("centring"), 0, episode, noise=0.1)[1] for episode in range(args.episodes)]
     logging.getLogger(__name__).info("%d demonstrations in %d attempts", args.episodes, sum(tried))
