@@ -17,7 +17,7 @@ ATTEMPTS = 10
 SEEDS_PER_EPISODE, SEEDS_PER_RECORDING = 100, 10**9
 
 # Feature -> its values in every frame, time first.
-Episode = dict[str, NDArray[Any]]
+EpisodeFrames = dict[str, NDArray[Any]]
 
 
 def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
@@ -25,7 +25,7 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     return SEEDS_PER_RECORDING * (seed + 1) + SEEDS_PER_EPISODE * episode + attempt
 
 
-def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) -> tuple[Episode, int]:
+def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) -> tuple[EpisodeFrames, int]:
     """Return a successful episode and the attempts it took; it depends on the arguments alone.
 
     Args:

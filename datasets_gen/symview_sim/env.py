@@ -11,24 +11,24 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera
-from lerobot_symview.geometry.placement import CameraSpec, top_camera
-from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
 from symview_sim.depth_sensor import degrade
 from symview_sim.motions import MAX_STEP, MAX_TURN
 from symview_sim.rendering import Picture, render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
+from symview_sim.settings import EnvSettings
 from symview_sim.tasks import make_task
 
 START_HEIGHT = 0.2
 GRIPPER_HEIGHTS = (0.02, 0.25)  # metres the gripper may reach; below 2 cm the fingers touch the table
 RENDER_HEIGHT = 256
 
-Observation = dict[str, Any]
+EnvObservation = dict[str, Any]
 
 
-class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     """A tabletop task seen by freely placed RGBD cameras.
 
     Action: (5,) float32 dx, dy, dz (metres, clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in [0, 1].
@@ -41,55 +41,25 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     End: success, an object out of reach, or `max_steps` actions.
 
     Args:
-        task: a name from `symview_sim.TASK_NAMES`.
-        robot: a name in `symview_sim.robots.ROBOTS`.
-        cameras: where the cameras stand.
-        oracle: adds the camera `top`, which looks straight down and does not see the arm.
-        depth: whether observations hold depth.
-        segmentation: whether observations hold segmentation.
-        workspace: the working area.
-        start_jitter: largest displacement of the start position per axis, metres.
-        max_steps: actions per episode.
-        render_mode: `rgb_array` (or None); `render()` returns the first camera's view.
+        settings: task, robot, workspace, cameras and limits.
+        render_mode: `rgb_array` (or None); `render()` returns the first camera's image.
 
     Raises:
-        ValueError: two cameras of one name, or of names such as `side` and `side_depth`, or a camera that does not see
-            the workspace.
+        CalibrationError: if a camera's image contains less than 60 % of the working volume.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  gymnasium's own form
 
-    def __init__(
-        self,
-        task: str,
-        robot: str = "panda",
-        cameras: tuple[CameraSpec, ...] = (CameraSpec(),),
-        oracle: bool = False,
-        depth: bool = True,
-        segmentation: bool = False,
-        workspace: Workspace | None = None,
-        start_jitter: float = 0.0,
-        max_steps: int = 50,
-        render_mode: str | None = "rgb_array",
-    ):
-        self.task = task
-        self._task = make_task(task)
+    def __init__(self, settings: EnvSettings, render_mode: str | None = "rgb_array"):
+        self.settings = settings
+        self.task, self.workspace = settings.task, settings.workspace
+        self._task = make_task(settings.task)
         self.task_description = self._task.instruction
-        self.workspace = workspace or Workspace()
         self.render_mode = render_mode
-        self._max_episode_steps = max_steps
-        self._start_jitter = start_jitter
-        self._robot = lookup("robot", robot, ROBOTS)
-        self.specs = (*cameras, top_camera(cameras[0].height, self.workspace)) if oracle else tuple(cameras)
-        names = [spec.name for spec in self.specs]
-        if len(set(names)) < len(names):
-            raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
-        for name in names:
-            longer = [other for other in names if other.startswith(f"{name}_")]
-            if longer:
-                raise ValueError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
+        self._max_episode_steps = settings.max_steps  # LeRobot reads it under this name
+        self._robot = lookup("robot", settings.robot, ROBOTS)
+        self.specs = settings.all_cameras
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
-        self._depth, self._segmentation = depth, segmentation
         self._scene: Scene | None = None
         self._steps = 0
         corners = self.workspace.corners()
@@ -97,7 +67,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
         self._action_low, self._action_high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         self.action_space = gymnasium.spaces.Box(self._action_low, self._action_high)
-        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras, depth, segmentation))
+        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras, settings))
 
     @property
     def scene(self) -> Scene:
@@ -106,11 +76,12 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._scene = Scene(self._robot, self.workspace)
         return self._scene
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[EnvObservation, dict]:
         """Start an episode; everything random in it follows from `seed`."""
         super().reset(seed=seed)
         self._steps = 0
-        jitter = self.np_random.uniform(-self._start_jitter, self._start_jitter, size=3)
+        largest = self.settings.start_jitter
+        jitter = self.np_random.uniform(-largest, largest, size=3)
         start = np.array([*self.workspace.center, START_HEIGHT]) + jitter
         self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
         self._task.spawn(self.scene, self.np_random)
@@ -119,7 +90,7 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.cameras |= {spec.name: spec.place(self.workspace, pose_rng) for spec in self.specs if spec.varies}
         return self._observe(), {"is_success": False}
 
-    def step(self, action: NDArray[np.floating]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.floating]) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
         """Move the gripper by `action` (5,), clamped to the action space."""
         arm = self.scene.arm
         *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
@@ -149,10 +120,10 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._scene.close()
             self._scene = None
 
-    def _observe(self) -> Observation:
+    def _observe(self) -> EnvObservation:
         arm = self.scene.arm
         position = arm.position - (*self.workspace.center, 0.0)
-        observation: Observation = {
+        observation: EnvObservation = {
             "agent_pos": np.array([*position, arm.yaw, arm.aperture], dtype=np.float32),
             "pixels": {},
         }
@@ -160,9 +131,9 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             name, camera = spec.name, self.cameras[spec.name]
             picture = self._picture(spec)
             observation["pixels"][name] = picture.rgb
-            if self._depth:
+            if self.settings.depth:
                 observation[_env_key(keys.depth(name))] = picture.depth[None]
-            if self._segmentation:
+            if self.settings.segmentation:
                 assert picture.labels is not None
                 labels = np.repeat(picture.labels[..., None], 3, axis=-1)
                 observation["pixels"][_camera_name(keys.segmentation(name))] = labels
@@ -173,13 +144,18 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _picture(self, spec: CameraSpec) -> Picture:
         camera = self.cameras[spec.name]
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
-            picture = render(self.scene.client, camera, labelled=self._segmentation)
+            picture = render(self.scene.client, camera, labelled=self.settings.segmentation)
         if spec.depth_noise == spec.depth_dropout == 0:
             return picture
         return picture._replace(depth=degrade(picture.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
 
 
-def named_features(observation: Observation) -> dict[str, NDArray[Any]]:
+def make_env(render_mode: str | None = "rgb_array", **options: Any) -> SymviewEnv:
+    """Return the environment for `gymnasium.make`, whose keyword arguments are the fields of `EnvSettings`."""
+    return SymviewEnv(EnvSettings(**options), render_mode)
+
+
+def named_features(observation: EnvObservation) -> dict[str, NDArray[Any]]:
     """Name what was observed as LeRobot's datasets do, depth with its channel last."""
     features = {keys.STATE: observation["agent_pos"]}
     features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
@@ -199,16 +175,16 @@ def _camera_name(key: str) -> str:
     return key.removeprefix("observation.images.")
 
 
-def _observation_spaces(cameras: dict[str, Camera], depth: bool, segmentation: bool) -> dict[str, gymnasium.Space[Any]]:
+def _observation_spaces(cameras: dict[str, Camera], settings: EnvSettings) -> dict[str, gymnasium.Space[Any]]:
     box = gymnasium.spaces.Box
     pixels: dict[str, gymnasium.Space[Any]] = {}
     spaces: dict[str, gymnasium.Space[Any]] = {"agent_pos": box(-np.inf, np.inf, (len(keys.STATE_NAMES),), np.float32)}
     for name, camera in cameras.items():
         shape = (camera.height, camera.width)
         pixels[name] = box(0, 255, (*shape, 3), np.uint8)
-        if segmentation:
+        if settings.segmentation:
             pixels[_camera_name(keys.segmentation(name))] = box(0, 255, (*shape, 3), np.uint8)
-        if depth:
+        if settings.depth:
             spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, *shape), np.float32)
         spaces[_env_key(keys.intrinsics(name))] = box(-np.inf, np.inf, (9,), np.float32)
         spaces[_env_key(keys.world_from_cam(name))] = box(-np.inf, np.inf, (16,), np.float32)

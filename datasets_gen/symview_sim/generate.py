@@ -41,7 +41,7 @@ EXAMPLES = """\
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
 
-@dataclass(frozen=True)
+@dataclass(unsafe_hash=True)
 class RecordedEnv(EnvSettings):
     """The environment of a recording, which shows the oracle too."""
 

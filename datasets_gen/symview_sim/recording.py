@@ -26,7 +26,7 @@ import numpy as np
 
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.runtime.staging import disk_errors, part_of, plain
-from symview_sim.demonstration import Episode, demonstrate
+from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import EnvSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
@@ -174,7 +174,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
     )
 
 
-def _frames(file: Path) -> Iterator[Episode]:
+def _frames(file: Path) -> Iterator[EpisodeFrames]:
     with np.load(file) as content:
         episode = {key: content[key] for key in content.files if key != ATTEMPTS_KEY}
     for index in range(len(next(iter(episode.values())))):

@@ -28,7 +28,7 @@ from lerobot_symview.geometry.camera import stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, make_view
-from symview_sim.env import Observation as RawObservation
+from symview_sim.env import EnvObservation as RawObservation
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
 

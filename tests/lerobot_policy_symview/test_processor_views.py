@@ -15,7 +15,6 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import VIEWS, Frame, make_view
 from lerobot_symview.views.reprojection import INFILLS
 from symview_sim.demonstration import episode_seed
-from symview_sim.env import SymviewEnv
 from symview_sim.settings import EnvSettings
 from tests.conftest import VIEW_SIZE
 from tests.helpers.policies import make_config
@@ -26,7 +25,7 @@ OPTIONS = {name: {"size": VIEW_SIZE} for name in VIEWS}
 @pytest.fixture(scope="module")
 def observed():
     """A batch of one observation, as lerobot-eval hands it to the processors: the first frame of the recording."""
-    env = SymviewEnv("block_picking")
+    env = EnvSettings("block_picking").make()
     observation, _ = env.reset(seed=episode_seed(0, 0))
     env.close()
     batched = {

@@ -18,9 +18,8 @@ from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.runtime.cli import CommandError
 from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
-from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import NewDataset
+from symview_sim.settings import EnvSettings, NewDataset
 from tests.conftest import EPISODES
 from tests.helpers.files import largest_file
 
@@ -61,7 +60,7 @@ def reference(small_shards, tmp_path_factory):
 
 def test_the_dataset_holds_what_the_environment_showed(recorded):
     dataset = LeRobotDataset("test/recorded", root=recorded, depth_output_unit="m")
-    env = SymviewEnv("block_picking", oracle=True)
+    env = EnvSettings("block_picking", oracle=True).make()
     index = 0
     for episode in range(EPISODES):
         observation, _ = env.reset(seed=episode_seed(0, episode))
