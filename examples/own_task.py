@@ -46,7 +46,7 @@ class BlockCentring(Task):
     def expert_action(self, scene: Scene) -> np.ndarray:
         """Grasp the block, carry it to the mark and let go: from the present state alone, so it may be disturbed."""
         if scene.arm.holds(self.block):
-            return carry(scene, self.goal, turn=0.0, travel_height=CLEARANCE)
+            return carry(scene, self.goal, yaw_change=0.0, travel_height=CLEARANCE)
         return grasp(scene, self.block, from_above=False)
 
 

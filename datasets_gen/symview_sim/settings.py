@@ -84,7 +84,7 @@ class EnvSettings:
 
 @dataclass(frozen=True)
 class RecordedDataset(DatasetTarget):
-    """Where demonstrations are."""
+    """Location of recorded demonstrations."""
 
     repo_id: str = "symview/demonstrations"
     """`user/name`, its name on the Hub."""
@@ -92,4 +92,4 @@ class RecordedDataset(DatasetTarget):
 
 @dataclass(frozen=True)
 class NewDataset(HubOptions, RecordedDataset):
-    """Where demonstrations go."""
+    """Location of new demonstrations, and options of a push to the Hub."""

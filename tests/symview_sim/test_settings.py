@@ -32,7 +32,7 @@ def test_equal_settings_have_equal_hashes():
     assert EnvSettings(camera=SIDE) != EnvSettings(camera=LEFT)
 
 
-def test_a_recording_has_the_oracle_unless_told_otherwise():
+def test_a_recording_has_the_oracle_by_default():
     assert [spec.name for spec in RecordedEnv(more_cameras=(LEFT,)).all_cameras] == ["side", "left", "top"]
     assert [spec.name for spec in EnvSettings().all_cameras] == ["side"]
 
@@ -55,8 +55,8 @@ def test_the_task_happens_in_the_workspace():
         top = observation["pixels"]["top"].astype(int)
         rows, columns = np.nonzero(top[..., 0] > 2 * top[..., 1])
         block = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
-        seen = workspace.xy_from_pixel(np.array([rows.mean(), columns.mean()]), len(top))
-        np.testing.assert_allclose(seen, block, atol=0.01)
+        actual = workspace.xy_from_pixel(np.array([rows.mean(), columns.mean()]), len(top))
+        np.testing.assert_allclose(actual, block, atol=0.01)
     env.close()
 
 
@@ -75,7 +75,7 @@ def test_the_task_happens_in_the_workspace():
         ({"more_cameras": (replace(LEFT, name="top"),), "oracle": True}, "differ in their names, got side, top, top"),
     ],
 )
-def test_impossible_settings_are_refused(options, message):
+def test_invalid_settings_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         EnvSettings(**options)
 
