@@ -90,9 +90,7 @@ class Arm:
         start = np.array([state[0] for state in self._client.getJointStates(self.body, self._joints)])
         goal = np.array(self._solve(position, yaw))
         progress = np.arange(1, RAMP_STEPS + 1)[:, None] / RAMP_STEPS
-        for angles in (
-            start + (goal - start) * progress
-        ).tolist():  # a sudden target would throw the objects that the arm hits
+        for angles in (start + (goal - start) * progress).tolist():  # a sudden target would throw objects in the way
             self._command_arm(angles)
             simulate()
         for _ in range(ARM_STEPS - RAMP_STEPS):
@@ -162,7 +160,7 @@ class Arm:
         heading = self._heading
         yaw_change = yaw_difference(heading, yaw, period=np.pi)
         lower, upper = self._wrist_limits
-        # The opposite rotation is for a wrist at its joint limit.
+        # If the shorter rotation exceeds the wrist's limits, rotate in the opposite direction.
         for half_turn in (0.0, -np.copysign(np.pi, yaw_change)):
             *arm, wrist = self._inverse_kinematics(position, heading + yaw_change + half_turn)
             wrist = (wrist + np.pi) % (2 * np.pi) - np.pi

@@ -77,11 +77,7 @@ class Scene:
         return int(body)
 
     def add_marking(self, side: float, color: Color, place: Array) -> int:
-        """Add a square of `side` metres on the table, visible but without contacts, centred at `place` (2,) metres.
-
-        Returns:
-            its body id.
-        """
+        """Add a visible square of `side` metres, without contacts, centred at `place` (2,) metres; return its id."""
         half_extents = [side / 2, side / 2, MARKING_HEIGHT / 2]
         shape = self.client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=[*color, 1.0])
         return int(self.client.createMultiBody(0, -1, shape, [*np.asarray(place).tolist(), MARKING_HEIGHT / 2]))
