@@ -7,20 +7,20 @@ The commands know the task once a package of yours has its name as an entry poin
 
 import argparse
 import logging
-from importlib.metadata import EntryPoint
 
 import numpy as np
 
-from lerobot_symview.registry import added
 from symview_sim.demonstration import demonstrate
 from symview_sim.grasping import CLEARANCE, carry, grasp
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
+from symview_sim.tasks import register_task
 from symview_sim.tasks.base import Task
 
 EDGE, NEAR = 0.05, 0.02  # metres
 
 
+@register_task("centring")
 class BlockCentring(Task):
     """A green block lies around a blue mark; solved when it stands on the mark, let go."""
 
@@ -46,7 +46,7 @@ class BlockCentring(Task):
     def expert_action(self, scene: Scene) -> np.ndarray:
         """Grasp the block, carry it to the mark and let go: from the present state alone, so it may be disturbed."""
         if scene.arm.holds(self.block):
-            return carry(scene, self.goal, turn=0.0, travel_height=CLEARANCE)
+            return carry(scene, self.goal, yaw_change=0.0, travel_height=CLEARANCE)
         return grasp(scene, self.block, from_above=False)
 
 
@@ -55,6 +55,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=20)
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    added("symview.tasks")["centring"] = EntryPoint("centring", f"{__name__}:BlockCentring", "symview.tasks")
     tried = [demonstrate(EnvSettings("centring"), 0, episode, noise=0.1)[1] for episode in range(args.episodes)]
     logging.getLogger(__name__).info("%d demonstrations in %d attempts", args.episodes, sum(tried))

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 def main(elevation_deg: float, seed: int, picture: Path) -> None:
     """Take an image, make both views, and find the block in one."""
-    env = gymnasium.make(symview_sim.gym_id("block_picking"), cameras=(CameraSpec(elevation_deg=elevation_deg),))
+    env = gymnasium.make(symview_sim.gym_id("block_picking"), camera=CameraSpec(elevation_deg=elevation_deg))
     observation, _ = env.reset(seed=seed)
     env.close()
     rgb = observation["pixels"]["side"]  # (H, W, 3) uint8

@@ -14,7 +14,7 @@ import pytest
 
 from lerobot_symview import registry
 from lerobot_symview.views import VIEWS
-from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 
@@ -166,7 +166,7 @@ def test_an_example_does_what_it_says(name, run, tmp_path):
 
 
 def test_the_block_is_found_where_it_lies(run):
-    env = SymviewEnv("block_picking")
+    env = EnvSettings("block_picking").make()
     env.reset(seed=5)
     lies = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
     env.close()

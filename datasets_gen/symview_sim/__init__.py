@@ -1,4 +1,4 @@
-"""PyBullet tasks with scripted experts, seen by freely placed cameras. Importing it does not start PyBullet."""
+"""PyBullet tasks with scripted experts and freely placed cameras. Importing this package does not import PyBullet."""
 
 import gymnasium
 
@@ -13,4 +13,4 @@ def gym_id(task: str) -> str:
 
 
 for _task in TASK_NAMES:
-    gymnasium.register(id=gym_id(_task), entry_point="symview_sim.env:SymviewEnv", kwargs={"task": _task})
+    gymnasium.register(id=gym_id(_task), entry_point="symview_sim.env:make_env", kwargs={"task": _task})

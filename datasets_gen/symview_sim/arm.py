@@ -1,4 +1,4 @@
-"""A robot arm with a parallel gripper, driven by Cartesian targets in a fixed number of simulation steps."""
+"""A robot arm with a parallel gripper. Each Cartesian target takes a fixed number of simulation steps."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike
 
 from lerobot_symview.geometry.camera import Array
 from symview_sim.bullet import pybullet, silenced
-from symview_sim.motions import nearest_turn
+from symview_sim.motions import yaw_difference
 from symview_sim.robots import RobotSpec
 
-ARM_STEPS, GRIPPER_STEPS = 40, 25  # simulation steps at 1/240 s: 0.27 s an action
-RAMP_STEPS = 27  # of the arm's steps, in which its target moves to the goal; it settles in the others
+ARM_STEPS, GRIPPER_STEPS = 40, 25  # simulation steps of 1/240 s: 0.27 s per action
+RAMP_STEPS = 27  # the joint targets reach the goal in these of the ARM_STEPS; the arm settles in the others
 POSITION_GAIN = 0.2
-# Steel on wood. Grippier fingers jam on a cube's corners instead of turning it into line: at 1.0 a cube held 35 degrees
-# askew stays so, at 0.2 it slips out.
+# Steel on wood. With more friction the fingers jam on a cube's corners instead of aligning it: at 1.0 a cube grasped 35
+# degrees askew stays askew, at 0.2 it slips out.
 FINGER_FRICTION = 0.3
-# Always this many: Bullet stops early when the position is right, whatever the orientation, and then a turn on the spot
-# ends 14 cm away.
+# The residual of 0 enforces all iterations. Otherwise Bullet stops as soon as the position is right, whatever the
+# orientation, and a rotation in place then ends 14 cm away.
 IK_ITERATIONS, IK_RESIDUAL = 150, 0.0
 IDENTITY = (0.0, 0.0, 0.0, 1.0)  # quaternion
 
@@ -34,15 +34,15 @@ def _load(client: Any, spec: RobotSpec) -> int:
         center_of_mass, _ = client.getBasePositionAndOrientation(body)
         client.resetBasePositionAndOrientation(body, np.add(center_of_mass, spec.base).tolist(), IDENTITY)
         return int(body)
-    # The collision meshes are drawn in place of the visual ones: 3.5k triangles for 100k, nine tenths of the time.
-    # Links that do not move against each other are made one: a third of a simulation step.
+    # Bullet then renders the collision meshes, 3.5k triangles instead of 100k, which saves nine tenths of the time.
+    # Merging links that are fixed to each other saves a third of a simulation step.
     flags = pybullet.URDF_IGNORE_VISUAL_SHAPES | pybullet.URDF_MERGE_FIXED_LINKS
-    with silenced():  # it names every link
+    with silenced():  # loadURDF prints every link
         return int(client.loadURDF(spec.model, spec.base, useFixedBase=True, flags=flags))
 
 
 class Arm:
-    """A robot in one PyBullet client. Yaw 0 opens the fingers along world x; yaw is kept in [-pi/2, pi/2)."""
+    """A robot in one PyBullet client. At yaw 0 the fingers open along world x; yaw is in [-pi/2, pi/2)."""
 
     def __init__(self, client: Any, spec: RobotSpec):
         self._client = client
@@ -66,12 +66,12 @@ class Arm:
         self._paint(1.0)
 
     def pass_through(self, body: int) -> None:
-        """Let all but the gripper pass through `body`, which it then need not be tested against."""
+        """Disable collisions between `body` and the arm, except for the gripper. This saves collision tests."""
         for link in (-1, *self._joints):
             self._client.setCollisionFilterPair(self.body, body, link, -1, 0)
 
     def reset(self, position: ArrayLike, yaw: float) -> None:
-        """Place the gripper, open, at `position` (3,) metres, world frame, without simulating the way there."""
+        """Set the joints so that the open gripper is at `position` (3,) metres, world frame, and `yaw`, rad."""
         for joint, angle in zip(self._joints, self._spec.home, strict=True):
             self._client.resetJointState(self.body, joint, angle)
         for joint, angle in zip(self._gripper_joints, self._open, strict=True):
@@ -82,12 +82,15 @@ class Arm:
         self._command_fingers(1.0)
 
     def move(self, position: ArrayLike, yaw: float, aperture: float) -> None:
-        """Move the gripper to `position` (3,), `yaw`, then open it to `aperture` in [0, 1]; always as many steps."""
+        """Move the gripper to `position` (3,) metres and `yaw`, rad, then open it to `aperture` in [0, 1].
+
+        The number of simulation steps is always the same.
+        """
         simulate = self._client.stepSimulation
         start = np.array([state[0] for state in self._client.getJointStates(self.body, self._joints)])
         goal = np.array(self._solve(position, yaw))
         progress = np.arange(1, RAMP_STEPS + 1)[:, None] / RAMP_STEPS
-        for angles in (start + (goal - start) * progress).tolist():  # a target that jumps would throw what it hits
+        for angles in (start + (goal - start) * progress).tolist():  # a sudden target would throw objects in the way
             self._command_arm(angles)
             simulate()
         for _ in range(ARM_STEPS - RAMP_STEPS):
@@ -104,12 +107,12 @@ class Arm:
 
     @property
     def yaw(self) -> float:
-        """Direction of the fingers' opening axis in [-pi/2, pi/2), rad."""
+        """Angle of the fingers' opening axis about z, in [-pi/2, pi/2), rad."""
         return float((self._heading + np.pi / 2) % np.pi - np.pi / 2)
 
     @property
     def aperture(self) -> float:
-        """How far the gripper is open, 0 to 1."""
+        """Opening of the gripper in [0, 1]: 0 closed, 1 open."""
         states = self._client.getJointStates(self.body, self._gripper_joints)
         travel, moved = self._open - self._closed, np.array([state[0] for state in states]) - self._closed
         return float(np.clip(moved @ travel / (travel @ travel), 0.0, 1.0))
@@ -127,7 +130,7 @@ class Arm:
 
     @contextmanager
     def hidden(self) -> Iterator[None]:
-        """Leave the arm out of what is rendered meanwhile."""
+        """Render images without the arm inside the context."""
         self._paint(0.0)
         try:
             yield
@@ -145,7 +148,7 @@ class Arm:
 
     @property
     def _heading(self) -> float:
-        """Yaw up to a full turn, which tells the two fingers apart."""
+        """Yaw modulo 2 pi, which distinguishes the two fingers, rad."""
         rotation = self._rotation(self._hand_state()[5])
         return float(np.arctan2(rotation[1, 0], rotation[0, 0])) - self._spec.finger_yaw
 
@@ -153,12 +156,13 @@ class Arm:
         return np.reshape(self._client.getMatrixFromQuaternion(quaternion), (3, 3))
 
     def _solve(self, position: ArrayLike, yaw: float) -> list[float]:
-        """Return the arm's joint angles, rad, that bring the gripper to `position` (3,), its yaw up to half a turn."""
+        """Return the joint angles, rad, that bring the gripper to `position` (3,) metres and to `yaw` modulo pi."""
         heading = self._heading
-        turn = nearest_turn(heading, yaw, period=np.pi)
+        yaw_change = yaw_difference(heading, yaw, period=np.pi)
         lower, upper = self._wrist_limits
-        for half_turn in (0.0, -np.copysign(np.pi, turn)):  # back, where the near way leads past the wrist's limits
-            *arm, wrist = self._inverse_kinematics(position, heading + turn + half_turn)
+        # If the shorter rotation exceeds the wrist's limits, rotate in the opposite direction.
+        for half_turn in (0.0, -np.copysign(np.pi, yaw_change)):
+            *arm, wrist = self._inverse_kinematics(position, heading + yaw_change + half_turn)
             wrist = (wrist + np.pi) % (2 * np.pi) - np.pi
             if lower <= wrist <= upper:
                 break

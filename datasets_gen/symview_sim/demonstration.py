@@ -1,4 +1,4 @@
-"""An expert's demonstration of a task, recorded frame by frame."""
+"""Demonstrations of a task by its scripted expert."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ from symview_sim.settings import EnvSettings
 ATTEMPTS = 10
 SEEDS_PER_EPISODE, SEEDS_PER_RECORDING = 100, 10**9
 
-# Feature -> its values in every frame, time first.
-Episode = dict[str, NDArray[Any]]
+EpisodeFrames = dict[str, NDArray[Any]]
+"""Values of every feature, by dataset key; the first axis is the frame."""
 
 
 def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
-    """Return the environment's seed of an episode of the recording `seed`; `lerobot-eval` seeds from 1000 upwards."""
+    """Return the environment's seed of an attempt at an episode of the recording `seed`.
+
+    The seeds are at least 10^9: `lerobot-eval` uses seeds from 1000 upwards.
+    """
     return SEEDS_PER_RECORDING * (seed + 1) + SEEDS_PER_EPISODE * episode + attempt
 
 
-def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) -> tuple[Episode, int]:
-    """Return a successful episode and the attempts it took; it depends on the arguments alone.
+def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) -> tuple[EpisodeFrames, int]:
+    """Return a successful episode and the number of attempts. The result depends on the arguments alone.
 
     Args:
-        settings: the environment, which a process makes once.
-        seed: the recording's.
-        episode: its number in the recording.
-        noise: standard deviation of a disturbance of every motion, as a fraction of the largest one.
+        settings: the environment's; a process makes each environment once.
+        seed: the recording's seed.
+        episode: index of the episode in the recording.
+        noise: standard deviation of the action noise, as a fraction of the largest action.
 
     Raises:
-        CommandError: when ten attempts in a row fail, which an undisturbed expert's never do in 50 steps.
+        CommandError: if ten attempts in a row fail. Without noise, no expert does so within 50 steps.
     """
     env = _environment(settings)
     for attempt in range(ATTEMPTS):
@@ -53,16 +56,16 @@ def _environment(settings: EnvSettings) -> SymviewEnv:
 
 
 def _attempt(env: SymviewEnv, seed: int, noise: float) -> list[dict[str, NDArray[Any]]] | None:
-    """Return an episode's frames if the expert succeeds."""
+    """Return an episode's frames, or None if the expert fails."""
     observation, _ = env.reset(seed=seed)
-    disturbances = np.random.default_rng(seed)
-    largest = np.append(env.action_space.high[:4], 0.0)  # type: ignore[attr-defined]  # the aperture is left alone
+    noise_rng = np.random.default_rng(seed)
+    largest = np.append(env.action_space.high[:4], 0.0)  # type: ignore[attr-defined]  # the aperture has no noise
     frames = []
     done = False
     while not done:
         action = env.expert_action()
         before = observation
-        disturbance = noise * largest * disturbances.standard_normal(len(action))
+        disturbance = noise * largest * noise_rng.standard_normal(len(action))
         observation, reward, terminated, truncated, info = env.step(action + disturbance)
         done = terminated or truncated
         outcome = {

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: one task, one arm, any cameras."""
+"""The Gymnasium environment: one task, one robot arm, any number of cameras."""
 
 from __future__ import annotations
 
@@ -11,115 +11,89 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera
-from lerobot_symview.geometry.placement import CameraSpec, top_camera
-from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
 from symview_sim.depth_sensor import degrade
-from symview_sim.motions import MAX_STEP, MAX_TURN
+from symview_sim.motions import MAX_STEP, MAX_YAW_STEP
 from symview_sim.rendering import Picture, render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
+from symview_sim.settings import EnvSettings
 from symview_sim.tasks import make_task
 
-START_HEIGHT = 0.2
-GRIPPER_HEIGHTS = (0.02, 0.25)  # metres the gripper may reach; below 2 cm the fingers touch the table
-RENDER_HEIGHT = 256
+START_HEIGHT = 0.2  # metres
+GRIPPER_HEIGHTS = (0.02, 0.25)  # metres, limits of the gripper's z; below 2 cm the fingers touch the table
+RENDER_HEIGHT = 256  # pixels
 
-Observation = dict[str, Any]
+EnvObservation = dict[str, Any]
 
 
-class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """A tabletop task seen by freely placed RGBD cameras.
+class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
+    """A tabletop manipulation task with freely placed RGBD cameras.
 
-    Action: (5,) float32 dx, dy, dz (metres, clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in [0, 1].
-    Observation: `pixels[camera]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W) metres, 0 = invalid;
-    `pixels[<camera>_segmentation]` uint8 (H, W, 3), 0 table, 1 robot, 2 and up objects in each channel;
-    `camera.<camera>.intrinsics` (9,), `camera.<camera>.world_from_cam` (16,); `agent_pos` (5,) gripper x, y (metres,
-    relative to the workspace centre), z, yaw (radians), aperture.
-    Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` says so.
-    Start: gripper open, 20 cm above the workspace centre, objects at random, cameras anew if they have a spread.
+    Action: (5,) float32: dx, dy, dz (metres, each clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in
+    [0, 1].
+    Observation: `pixels[<camera>]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W), metres along the optical
+    axis, 0 = invalid; `pixels[<camera>_segmentation]` uint8 (H, W, 3), the same label in each channel: 0 table,
+    1 robot, 2 and up objects; `camera.<camera>.intrinsics` float32 (9,), pixels, row-major;
+    `camera.<camera>.world_from_cam` float32 (16,), row-major; `agent_pos` float32 (5,): gripper x, y (metres, relative
+    to the workspace centre), z (metres), yaw (radians), aperture.
+    Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` is the same as a bool.
+    Start: gripper open, 20 cm above the workspace centre; objects at random poses; cameras with a spread at a new
+    random pose.
     End: success, an object out of reach, or `max_steps` actions.
 
     Args:
-        task: a name from `symview_sim.TASK_NAMES`.
-        robot: a name in `symview_sim.robots.ROBOTS`.
-        cameras: where the cameras stand.
-        oracle: adds the camera `top`, which looks straight down and does not see the arm.
-        depth: whether observations hold depth.
-        segmentation: whether observations hold segmentation.
-        workspace: the working area.
-        start_jitter: largest displacement of the start position per axis, metres.
-        max_steps: actions per episode.
-        render_mode: `rgb_array` (or None); `render()` returns the first camera's view.
+        settings: task, robot, workspace, cameras and limits.
+        render_mode: `rgb_array` (or None); `render()` returns the first camera's image.
 
     Raises:
-        ValueError: two cameras of one name, or of names such as `side` and `side_depth`, or a camera that does not see
-            the workspace.
+        CalibrationError: if a camera's image contains less than 60 % of the working volume.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  gymnasium's own form
 
-    def __init__(
-        self,
-        task: str,
-        robot: str = "panda",
-        cameras: tuple[CameraSpec, ...] = (CameraSpec(),),
-        oracle: bool = False,
-        depth: bool = True,
-        segmentation: bool = False,
-        workspace: Workspace | None = None,
-        start_jitter: float = 0.0,
-        max_steps: int = 50,
-        render_mode: str | None = "rgb_array",
-    ):
-        self.task = task
-        self._task = make_task(task)
+    def __init__(self, settings: EnvSettings, render_mode: str | None = "rgb_array"):
+        self.settings = settings
+        self.task, self.workspace = settings.task, settings.workspace
+        self._task = make_task(settings.task)
         self.task_description = self._task.instruction
-        self.workspace = workspace or Workspace()
         self.render_mode = render_mode
-        self._max_episode_steps = max_steps
-        self._start_jitter = start_jitter
-        self._robot = lookup("robot", robot, ROBOTS)
-        self.specs = (*cameras, top_camera(cameras[0].height, self.workspace)) if oracle else tuple(cameras)
-        names = [spec.name for spec in self.specs]
-        if len(set(names)) < len(names):
-            raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
-        for name in names:
-            longer = [other for other in names if other.startswith(f"{name}_")]
-            if longer:
-                raise ValueError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
+        self._max_episode_steps = settings.max_steps  # LeRobot reads it under this name
+        self._robot = lookup("robot", settings.robot, ROBOTS)
+        self.specs = settings.all_cameras
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
-        self._depth, self._segmentation = depth, segmentation
         self._scene: Scene | None = None
         self._steps = 0
         corners = self.workspace.corners()
         self._reach = [np.append(corner[:2], z) for corner, z in zip(corners[[0, 2]], GRIPPER_HEIGHTS, strict=True)]
-        limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN], dtype=np.float32)
+        limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_YAW_STEP], dtype=np.float32)
         self._action_low, self._action_high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         self.action_space = gymnasium.spaces.Box(self._action_low, self._action_high)
-        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras, depth, segmentation))
+        self.observation_space = gymnasium.spaces.Dict(_observation_spaces(self.cameras, settings))
 
     @property
     def scene(self) -> Scene:
-        """The simulator, started when first needed so that an environment costs nothing until it is reset."""
+        """The simulator. It starts at first use, so that an environment costs nothing before its first reset."""
         if self._scene is None:
             self._scene = Scene(self._robot, self.workspace)
         return self._scene
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict]:
-        """Start an episode; everything random in it follows from `seed`."""
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[EnvObservation, dict]:
+        """Start an episode. All its randomness follows from `seed`."""
         super().reset(seed=seed)
         self._steps = 0
-        jitter = self.np_random.uniform(-self._start_jitter, self._start_jitter, size=3)
+        largest = self.settings.start_jitter
+        jitter = self.np_random.uniform(-largest, largest, size=3)
         start = np.array([*self.workspace.center, START_HEIGHT]) + jitter
         self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
         self._task.spawn(self.scene, self.np_random)
         self.scene.settle()
-        pose_rng, self._sensor_rng = self.np_random.spawn(2)  # what is seen does not change what happens
+        pose_rng, self._sensor_rng = self.np_random.spawn(2)  # cameras do not change the physics
         self.cameras |= {spec.name: spec.place(self.workspace, pose_rng) for spec in self.specs if spec.varies}
         return self._observe(), {"is_success": False}
 
-    def step(self, action: NDArray[np.floating]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[np.floating]) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
         """Move the gripper by `action` (5,), clamped to the action space."""
         arm = self.scene.arm
         *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
@@ -131,11 +105,11 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(), float(success), terminated, truncated, {"is_success": success}
 
     def expert_action(self) -> NDArray[np.float32]:
-        """Return what the task's expert does in the present state, (5,) float32."""
+        """Return the expert's action in the current state, (5,) float32."""
         return self._task.expert_action(self.scene).astype(np.float32)
 
     def render(self) -> NDArray[np.uint8]:
-        """Return the first camera's view, uint8, 256 rows."""
+        """Return the first camera's image, (256, W, 3) uint8."""
         camera = next(iter(self.cameras.values()))
         scale = RENDER_HEIGHT / camera.height
         intrinsics = camera.intrinsics * [[scale], [scale], [1]]
@@ -149,38 +123,43 @@ class SymviewEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._scene.close()
             self._scene = None
 
-    def _observe(self) -> Observation:
+    def _observe(self) -> EnvObservation:
         arm = self.scene.arm
         position = arm.position - (*self.workspace.center, 0.0)
-        observation: Observation = {
+        observation: EnvObservation = {
             "agent_pos": np.array([*position, arm.yaw, arm.aperture], dtype=np.float32),
             "pixels": {},
         }
         for spec in self.specs:
             name, camera = spec.name, self.cameras[spec.name]
-            picture = self._picture(spec)
-            observation["pixels"][name] = picture.rgb
-            if self._depth:
-                observation[_env_key(keys.depth(name))] = picture.depth[None]
-            if self._segmentation:
-                assert picture.labels is not None
-                labels = np.repeat(picture.labels[..., None], 3, axis=-1)
+            image = self._render(spec)
+            observation["pixels"][name] = image.rgb
+            if self.settings.depth:
+                observation[_env_key(keys.depth(name))] = image.depth[None]
+            if self.settings.segmentation:
+                assert image.labels is not None
+                labels = np.repeat(image.labels[..., None], 3, axis=-1)
                 observation["pixels"][_camera_name(keys.segmentation(name))] = labels
             observation[_env_key(keys.intrinsics(name))] = camera.intrinsics.ravel().astype(np.float32)
             observation[_env_key(keys.world_from_cam(name))] = camera.world_from_cam.ravel().astype(np.float32)
         return observation
 
-    def _picture(self, spec: CameraSpec) -> Picture:
+    def _render(self, spec: CameraSpec) -> Picture:
         camera = self.cameras[spec.name]
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
-            picture = render(self.scene.client, camera, labelled=self._segmentation)
+            image = render(self.scene.client, camera, labelled=self.settings.segmentation)
         if spec.depth_noise == spec.depth_dropout == 0:
-            return picture
-        return picture._replace(depth=degrade(picture.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
+            return image
+        return image._replace(depth=degrade(image.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
 
 
-def named_features(observation: Observation) -> dict[str, NDArray[Any]]:
-    """Name what was observed as LeRobot's datasets do, depth with its channel last."""
+def make_env(render_mode: str | None = "rgb_array", **options: Any) -> SymviewEnv:
+    """Return an environment; the entry point of `gymnasium.make`. `options` are the fields of `EnvSettings`."""
+    return SymviewEnv(EnvSettings(**options), render_mode)
+
+
+def named_features(observation: EnvObservation) -> dict[str, NDArray[Any]]:
+    """Return an observation under the keys of a LeRobot dataset. Depth (1, H, W) becomes (H, W, 1)."""
     features = {keys.STATE: observation["agent_pos"]}
     features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
     for key in observation.keys() - {"agent_pos", "pixels"}:
@@ -190,25 +169,25 @@ def named_features(observation: Observation) -> dict[str, NDArray[Any]]:
 
 
 def _env_key(key: str) -> str:
-    """Observation key that LeRobot turns into `key`, which it does by prefixing `observation.`."""
+    """Return the observation key that LeRobot maps to `key`, by prefixing `observation.`."""
     return key.removeprefix("observation.")
 
 
 def _camera_name(key: str) -> str:
-    """Name under `pixels` that LeRobot turns into `key`, which it does by prefixing `observation.images.`."""
+    """Return the name under `pixels` that LeRobot maps to `key`, by prefixing `observation.images.`."""
     return key.removeprefix("observation.images.")
 
 
-def _observation_spaces(cameras: dict[str, Camera], depth: bool, segmentation: bool) -> dict[str, gymnasium.Space[Any]]:
+def _observation_spaces(cameras: dict[str, Camera], settings: EnvSettings) -> dict[str, gymnasium.Space[Any]]:
     box = gymnasium.spaces.Box
     pixels: dict[str, gymnasium.Space[Any]] = {}
     spaces: dict[str, gymnasium.Space[Any]] = {"agent_pos": box(-np.inf, np.inf, (len(keys.STATE_NAMES),), np.float32)}
     for name, camera in cameras.items():
         shape = (camera.height, camera.width)
         pixels[name] = box(0, 255, (*shape, 3), np.uint8)
-        if segmentation:
+        if settings.segmentation:
             pixels[_camera_name(keys.segmentation(name))] = box(0, 255, (*shape, 3), np.uint8)
-        if depth:
+        if settings.depth:
             spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, *shape), np.float32)
         spaces[_env_key(keys.intrinsics(name))] = box(-np.inf, np.inf, (9,), np.float32)
         spaces[_env_key(keys.world_from_cam(name))] = box(-np.inf, np.inf, (16,), np.float32)

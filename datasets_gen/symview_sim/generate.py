@@ -1,4 +1,4 @@
-"""`symview-generate`: expert demonstrations of a task as a LeRobot dataset."""
+"""`symview-generate`: record expert demonstrations of a task as a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -41,39 +41,39 @@ EXAMPLES = """\
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
 
-@dataclass(frozen=True)
+@dataclass(unsafe_hash=True)
 class RecordedEnv(EnvSettings):
-    """The environment of a recording, which shows the oracle too."""
+    """The environment settings of a recording. The oracle is recorded by default."""
 
     oracle: bool = True
-    """Also record `top`, which looks straight down and does not see the arm."""
+    """Add the camera `top`, which looks straight down and does not see the arm."""
 
 
 @dataclass(frozen=True)
 class GenerateConfig:
-    """Let a task's expert demonstrate it and record what the cameras see."""
+    """Record demonstrations of a task by its scripted expert as a LeRobot dataset."""
 
     dataset: NewDataset = field(default_factory=NewDataset)
-    """Where the dataset goes; `--root` is short for `--dataset.root`."""
+    """Location of the new dataset; `--root` is short for `--dataset.root`."""
     env: RecordedEnv = field(default_factory=RecordedEnv)
-    """What is demonstrated, and which cameras see it."""
+    """Task, robot arm, workspace and cameras."""
     num_episodes: int = 50
-    """How many successful demonstrations."""
+    """Number of successful demonstrations."""
     seed: int = 0
-    """Chooses the scenes: episode i starts from seed 10^9 (seed + 1) + 100 i, plus 1 for each failed attempt."""
+    """Random seed. Episode i starts from seed 10^9 (seed + 1) + 100 i, plus 1 for each failed attempt."""
     noise: float = 0.0
-    """Standard deviation of a disturbance of every motion, as a fraction of the largest one (0.2: 1 cm and 9 degrees).
-    The expert's own action is what is recorded, so that the dataset shows how to recover from small errors.
+    """Standard deviation of the noise added to each action, as a fraction of the largest action (0.2: 1 cm and 9
+    degrees). The dataset contains the expert's actions without noise and so shows how to recover from small errors.
     """
     video: bool = False
-    """Store images as video: colour without loss, depth up to 1.6 m with an error below 0.2 mm. The oracle's depth,
-    which is farther, stays images. Smaller on disk, several times slower to train from."""
+    """Store images as video: RGB lossless, depth up to 1.6 m with an error below 0.2 mm. The oracle's depth exceeds
+    1.6 m and is stored as images. Video is smaller on disk and several times slower to train from."""
     num_workers: int = 1
-    """Processes that simulate and write, unless RAY_ADDRESS names a cluster. Their number does not change the data."""
+    """Number of worker processes. It does not change the data. Ignored if RAY_ADDRESS names a cluster."""
     executor: str = "local"
-    """`local`, or `ray`: the cluster that RAY_ADDRESS names, whose machines see the same folders, or a local one."""
+    """`local`, or `ray`: the cluster of RAY_ADDRESS, whose machines must share the folders, or a local Ray."""
     resume: bool = False
-    """Go on with a recording that was interrupted."""
+    """Continue an interrupted recording."""
 
     def __post_init__(self) -> None:
         if self.num_episodes < 1:
@@ -88,7 +88,7 @@ class GenerateConfig:
 
 
 def generate(config: GenerateConfig) -> Path:
-    """Write the dataset that `config` describes, upload it if asked, and return its folder."""
+    """Record the dataset of `config`, push it to the Hub if requested, and return its folder."""
     folder = _write(config)
     if config.dataset.push_to_hub:
         push_dataset(config.dataset, config.dataset)
@@ -99,7 +99,7 @@ def _write(config: GenerateConfig) -> Path:
     target = config.dataset.folder()
     recording = _plan(config, target)
     if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):
-        logger.info("%s is complete already", target)
+        logger.info("%s is already complete", target)
         return target
     _begin(recording, config.resume)
     attempts = recorded_attempts(recording)
@@ -113,7 +113,7 @@ def _write(config: GenerateConfig) -> Path:
                 bar.update()
         shards = recording.shards()
         written = executor.run(partial(write_shard, recording), shards)
-        import lerobot.datasets  # noqa: F401  which takes seconds, while the workers import and write
+        import lerobot.datasets  # noqa: F401  takes seconds, in parallel with the workers
 
         folders = list(tqdm(written, desc="writing", total=len(shards), unit="shard"))
     join_shards(recording, sorted(folders)).rename(target)
@@ -149,19 +149,19 @@ def _begin(recording: Recording, resume: bool) -> None:
 
 
 def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:
-    """Raise ValueError if a camera sees a part of the workspace from farther than the video's depth reaches."""
+    """Raise a ValueError if a part of the workspace may be farther from a camera than the largest depth of a video."""
     half, height = env.workspace.size / 2, env.workspace.height_limit
     corners = np.concatenate([env.workspace.corners(), env.workspace.corners(height)])
     for spec in env.specs[: -1 if oracle else None]:
-        if spec.varies:  # from wherever it is drawn, the farthest corner is no farther than this
+        if spec.varies:  # an upper bound over all random poses
             farthest = spec.distance + spec.spread.distance + 2 * spec.spread.target
             farthest += float(np.linalg.norm(spec.target) + np.linalg.norm([half, half, height]))
         else:
             farthest = project(corners, env.cameras[spec.name])[1].max()
         if farthest > MAX_VIDEO_DEPTH:
             raise ValueError(
-                f"camera {spec.name!r} sees the workspace from up to {farthest:.2f} m, --video=true stores depth up to "
-                f"{MAX_VIDEO_DEPTH} m: bring it nearer or leave --video=false"
+                f"camera {spec.name!r} is up to {farthest:.2f} m from a point of the workspace, but "
+                f"--video=true stores depth up to {MAX_VIDEO_DEPTH} m: reduce its distance or use --video=false"
             )
 
 
@@ -194,5 +194,5 @@ def _features(env: SymviewEnv, config: GenerateConfig) -> Features:
 
 
 def main() -> None:
-    """Run the console command."""
+    """Run `symview-generate`."""
     run_command(GenerateConfig, generate, EXAMPLES, short={"--root": "--dataset.root"})

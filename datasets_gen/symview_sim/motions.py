@@ -1,4 +1,4 @@
-"""Pure functions that experts are made of. Each commutes with turning and mirroring the scene."""
+"""Pure functions that the experts share. Each is equivariant to rotations about z and reflections of the scene."""
 
 from __future__ import annotations
 
@@ -7,41 +7,58 @@ import numpy as np
 from lerobot_symview.geometry.camera import Array
 
 MAX_STEP = 0.05  # metres per action and axis
-MAX_TURN = np.pi / 4  # radians per action
+MAX_YAW_STEP = np.pi / 4  # radians per action
 ALIGNED_YAW = 0.1  # radians
 
 
-def nearest_turn(yaw_from: float, yaw_to: float, period: float) -> float:
-    """Return the smallest turn from `yaw_from` that reaches `yaw_to` up to `period` (pi: gripper, pi/2: cube), rad."""
+def yaw_difference(yaw_from: float, yaw_to: float, period: float) -> float:
+    """Return `yaw_to` - `yaw_from` modulo `period`, in [-period / 2, period / 2), rad.
+
+    The period is the symmetry of the object: pi for the gripper, pi / 2 for a cube.
+    """
     return float((yaw_to - yaw_from + period / 2) % period - period / 2)
 
 
-def step_towards(position: Array, goal: Array, turn: float) -> tuple[Array, bool]:
-    """Return the motion (4,) dx, dy, dz, dyaw towards `goal` (3,) and through `turn`, and whether it gets there."""
-    limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_TURN])
-    motion = np.append(np.asarray(goal) - position, turn)
+def step_towards(position: Array, goal: Array, yaw_change: float) -> tuple[Array, bool]:
+    """Return the motion (4,) dx, dy, dz, dyaw of one action, and whether it reaches the goal.
+
+    Args:
+        position: (3,) the gripper's, metres.
+        goal: (3,) metres.
+        yaw_change: rotation about z that remains to be done, rad.
+    """
+    limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_YAW_STEP])
+    motion = np.append(np.asarray(goal) - position, yaw_change)
     return np.clip(motion, -limits, limits), bool((np.abs(motion) <= limits).all())
 
 
-def _straight(way: Array, longest: float) -> Array:
-    """Shorten a horizontal `way` (2,) to at most `longest` metres per axis without changing its direction."""
-    return way * min(1.0, longest / max(np.abs(way).max(), 1e-9))
+def _limited(displacement: Array, longest: float) -> Array:
+    """Shorten a horizontal displacement (2,) to at most `longest` metres per axis; its direction is unchanged."""
+    return displacement * min(1.0, longest / max(np.abs(displacement).max(), 1e-9))
 
 
 def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, speed: float = MAX_STEP) -> Array:
-    """Return the motion (4,) of a sweep along the table from `start` to `end` (2,), approached from above `start`.
+    """Return the next motion (4,) of a sweep along the table from `start` to `end`, approached from above `start`.
 
-    What to do follows from where the gripper is: on the line and low, go on to `end`; above `start`, go down; else go
-    to 10 cm above `start`. The fingers' opening axis is kept across the sweep, whose steps are at most `speed` metres.
+    The gripper's position alone decides: low and on the line, continue to `end`; above `start`, descend; otherwise, go
+    to 10 cm above `start`. The fingers' opening axis stays perpendicular to the sweep.
+
+    Args:
+        position: (3,) the gripper's, metres.
+        yaw: the gripper's, rad.
+        start: (2,) metres.
+        end: (2,) metres.
+        height: of the gripper above the table during the sweep, metres.
+        speed: largest step per axis during the sweep, metres.
     """
     along = (end - start) / np.linalg.norm(end - start)
-    turn = nearest_turn(yaw, np.arctan2(along[0], -along[1]), period=np.pi)
+    yaw_change = yaw_difference(yaw, np.arctan2(along[0], -along[1]), period=np.pi)
     offset = position[:2] - start
     ahead, aside = offset @ along, abs(offset @ np.array([-along[1], along[0]]))
     is_low = position[2] < height + 0.015
     if is_low and aside < 0.02 and ahead > -0.02:
-        motion, _ = step_towards(position, np.array([*end, height]), turn)
-        motion[:2] = _straight(end - position[:2], speed)
+        motion, _ = step_towards(position, np.array([*end, height]), yaw_change)
+        motion[:2] = _limited(end - position[:2], speed)
         return motion
-    is_above = np.abs(offset).max() < 0.015 and abs(turn) < ALIGNED_YAW
-    return step_towards(position, np.array([*start, height if is_above else height + 0.1]), turn)[0]
+    is_above = np.abs(offset).max() < 0.015 and abs(yaw_change) < ALIGNED_YAW
+    return step_towards(position, np.array([*start, height if is_above else height + 0.1]), yaw_change)[0]

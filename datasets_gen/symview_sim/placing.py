@@ -1,4 +1,4 @@
-"""Random places for objects on the table."""
+"""Random positions of objects on the table."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ TRIES = 10_000
 def random_places(
     rng: np.random.Generator, workspace: Workspace, paddings: tuple[float, ...], distance: float = 0.0
 ) -> list[Array]:
-    """Draw one place (2,) per entry of `paddings`, uniformly, at least `distance` metres from each other.
+    """Draw one position (2,) per entry of `paddings`, uniformly, world frame, metres.
 
     Args:
         rng: source of randomness.
-        workspace: where the places lie, in world coordinates.
-        paddings: metres kept free at each side of the workspace, one per place.
-        distance: least distance between two places, metres.
+        workspace: the square that contains all positions.
+        paddings: distance of each position from the workspace's border, metres.
+        distance: smallest distance between two positions, metres.
 
     Raises:
-        RuntimeError: if so many places do not fit.
+        RuntimeError: if 10,000 draws contain no valid one.
     """
     for _ in range(TRIES):
         places = [
@@ -32,4 +32,4 @@ def random_places(
         gaps = [np.linalg.norm(a - b) for i, a in enumerate(places) for b in places[:i]]
         if all(gap > distance for gap in gaps):
             return places
-    raise RuntimeError(f"{len(paddings)} objects {distance} m apart do not fit into {workspace.size} m")
+    raise RuntimeError(f"{len(paddings)} objects {distance} m apart do not fit into a workspace of {workspace.size} m")

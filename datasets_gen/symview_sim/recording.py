@@ -1,12 +1,12 @@
-"""A recording in progress: a folder of finished episodes, the shards made from them, and the dataset made from those.
+"""A recording in progress: its finished episodes, their shards, and the dataset aggregated from the shards.
 
-    <target>.partial/request.json       what is recorded; a resumed run must ask for the same
-    <target>.partial/episodes/*.npz     an episode each, complete or absent
-    <target>.partial/shards/*           LeRobot datasets of neighbouring episodes, complete or absent
-    <target>.partial/dataset            the shards aggregated, moved to <target> in the end
+    <target>.partial/request.json       description of the recording; a resumed run must have the same
+    <target>.partial/episodes/*.npz     one episode per file, complete or absent
+    <target>.partial/shards/*           LeRobot datasets of consecutive episodes, complete or absent
+    <target>.partial/dataset            the aggregated shards, moved to <target> at the end
 
-Nothing in it depends on who simulated which episode when, so any number of workers write the same data, and a process
-killed at any moment loses the episodes it was simulating and no others.
+No file depends on which worker simulated an episode, or when: any number of workers writes the same data. A process
+that is killed loses only the episodes that it was simulating.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ import numpy as np
 
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.runtime.staging import disk_errors, part_of, plain
-from symview_sim.demonstration import Episode, demonstrate
+from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import EnvSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
 ATTEMPTS_KEY = "attempts"
 MADE_FROM = "symview_recording.json"  # in the finished dataset's `meta`
-# With its own block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images in spite of `lossless`.
+# With its default block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images despite `lossless`.
 LOSSLESS = "lossless=1:ctu=16:bframes=0"
 MAX_VIDEO_DEPTH = 1.6  # metres: with 12 bits, steps of 0.39 mm and errors of at most 0.2 mm
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What is recorded and where; small enough to send to every worker."""
+    """Description and location of a recording, small enough to send to every worker."""
 
     folder: Path
     """`<target>.partial`."""
@@ -54,27 +54,27 @@ class Recording:
     video: bool
 
     def episode_file(self, episode: int) -> Path:
-        """Where an episode is kept."""
+        """Return the file of an episode."""
         return self.folder / "episodes" / f"{episode:06d}.npz"
 
     def shards(self) -> list[range]:
-        """Return the episodes of every shard: 25 each, or more where that gives over 32 shards, whoever writes them."""
+        """Return the episodes of each shard: 25, or more to keep the number of shards at or below 32."""
         size = max(SHARD_EPISODES, -(-self.num_episodes // MAX_SHARDS))
         return [range(first, min(first + size, self.num_episodes)) for first in range(0, self.num_episodes, size)]
 
     def shard_folder(self, shard: range) -> Path:
-        """Where a shard is kept."""
+        """Return the folder of a shard."""
         return self.folder / "shards" / f"{shard.start:06d}"
 
     def description(self) -> dict[str, Any]:
-        """What determines the data, as JSON holds it."""
+        """Return everything that determines the data, as JSON values."""
         content = asdict(self)
         del content["folder"]
         return plain(content)
 
 
 def record_episode(recording: Recording, episode: int) -> int:
-    """Simulate an episode and keep it; return how many attempts it took."""
+    """Simulate an episode, write its file and return the number of attempts."""
     frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
     file = recording.episode_file(episode)
     part = part_of(file)
@@ -90,7 +90,7 @@ def record_episode(recording: Recording, episode: int) -> int:
 
 
 def recorded_attempts(recording: Recording) -> dict[int, int]:
-    """Return the attempts that each episode kept so far took, by episode."""
+    """Return the number of attempts of each episode recorded so far, by episode index."""
     attempts = {}
     for file in sorted((recording.folder / "episodes").glob("*.npz")):
         with np.load(file) as content:
@@ -99,7 +99,7 @@ def recorded_attempts(recording: Recording) -> dict[int, int]:
 
 
 def write_shard(recording: Recording, shard: range) -> Path:
-    """Write the LeRobot dataset of a shard's episodes, unless it is there, and return its folder."""
+    """Write the LeRobot dataset of a shard's episodes, unless it exists, and return its folder."""
     folder = recording.shard_folder(shard)
     if folder.exists():
         return folder
@@ -113,14 +113,14 @@ def write_shard(recording: Recording, shard: range) -> Path:
                     raise OSError(failures[0])
             dataset.save_episode(parallel_encoding=False)
         dataset.finalize()
-        shutil.rmtree(part / "images")  # LeRobot leaves its empty scratch folders behind
-        if not folder.exists():  # a cluster that lost sight of a worker has its work done twice
+        shutil.rmtree(part / "images")  # LeRobot does not remove its empty temporary folders
+        if not folder.exists():  # a cluster repeats the work of a worker that it has lost
             part.rename(folder)
     return folder
 
 
 def join_shards(recording: Recording, shards: list[Path]) -> Path:
-    """Aggregate the shards to one dataset, complete its metadata, and return its folder."""
+    """Aggregate the shards into one dataset, complete its metadata and return its folder."""
     from lerobot.datasets import aggregate_datasets
 
     joined = recording.folder / "dataset"
@@ -150,7 +150,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
     from lerobot.configs.video import DepthEncoderConfig, RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
-    av.logging.set_libav_level(av.logging.ERROR)  # FFmpeg tells of every pass over a file
+    av.logging.set_libav_level(av.logging.ERROR)  # FFmpeg logs every pass over a file
     lossless = {"x265-params": f"{LOSSLESS}:log-level=none"}
     encoders = {
         "rgb_encoder": RGBEncoderConfig(vcodec="hevc", pix_fmt="gbrp", crf=None, extra_options=lossless),
@@ -158,7 +158,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
             vcodec="hevc",
             pix_fmt="gray12le",
             extra_options=lossless,
-            depth_min=0.0,  # keeps 0, which says that nothing was measured
+            depth_min=0.0,  # stores 0, which marks invalid depth, exactly
             depth_max=MAX_VIDEO_DEPTH,
             use_log=False,
         ),
@@ -174,7 +174,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
     )
 
 
-def _frames(file: Path) -> Iterator[Episode]:
+def _frames(file: Path) -> Iterator[EpisodeFrames]:
     with np.load(file) as content:
         episode = {key: content[key] for key in content.files if key != ATTEMPTS_KEY}
     for index in range(len(next(iter(episode.values())))):
@@ -182,7 +182,7 @@ def _frames(file: Path) -> Iterator[Episode]:
 
 
 def _complete_metadata(dataset: Path, success_rate: float) -> None:
-    """State the expert's success with the facts of every camera, and sort the statistics, which come in any order."""
+    """Add the expert's success rate to each camera's metadata, and sort the statistics, whose order varies."""
     info, stats = dataset / "meta" / "info.json", dataset / "meta" / "stats.json"
     content = json.loads(info.read_text())
     for feature in content["features"].values():
@@ -195,7 +195,7 @@ def _complete_metadata(dataset: Path, success_rate: float) -> None:
 
 @contextmanager
 def _failed_images() -> Iterator[list[str]]:
-    """Yield a list to which every failure is added that LeRobot's image writer, which goes on regardless, only logs."""
+    """Yield a list that collects the errors of LeRobot's image writer, which logs them and continues."""
     failures: list[str] = []
     handler = logging.Handler(logging.ERROR)
     handler.emit = lambda record: failures.append(record.getMessage())  # type: ignore[method-assign]
@@ -209,6 +209,6 @@ def _failed_images() -> Iterator[list[str]]:
 
 @contextmanager
 def _unhashed() -> Iterator[None]:
-    """Spare LeRobot a sixth of the time: it has every episode's table hashed, to name a cache that it never uses."""
+    """Skip the hash of each episode's table, a sixth of the time. It names a cache that LeRobot never uses."""
     with patch("datasets.arrow_dataset.generate_fingerprint", return_value="0" * 16):
         yield

@@ -1,4 +1,4 @@
-"""Robot arms with parallel grippers, as data: naming one does not start a simulator."""
+"""Robot arms with parallel grippers, as data. Importing it does not import PyBullet."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """What distinguishes one robot model from another; asset paths are those of `pybullet_data`.
+    """The parameters of one robot model.
 
     Args:
-        model: model file, URDF or SDF.
-        base: where the model's origin stands, metres.
-        home: joint angles of the arm that start the search for a posture, rad.
-        hand_link: last link of the arm, whose z axis is the gripper's direction.
-        finger_links: links of either finger that grip.
-        gripper_joints: all other joints, by index: position when closed and when open (metres or rad), motor limit
-            (N or N m).
+        model: URDF or SDF file of `pybullet_data`.
+        base: position of the model's origin, world frame, metres.
+        home: initial joint angles of the inverse kinematics, rad.
+        hand_link: last link of the arm; its z axis is the approach direction of the gripper.
+        finger_links: gripping links of each finger.
+        gripper_joints: the other joints by index: position when closed, position when open (metres or rad) and motor
+            limit (N or N m).
         finger_yaw: angle from the fingers' opening axis to the hand frame's x axis, rad.
         arm_force: motor limit of an arm joint, N m.
-        hand_from_tool: the point between the fingertips in the hand's frame, metres.
-        joint_limits: lower and upper limits that replace the model's, by joint, rad.
+        hand_from_tool: (3,) point between the fingertips in the hand's frame, metres.
+        joint_limits: by joint: lower and upper limits that replace the model's, rad.
         color: RGBA of the arm; the gripper is drawn in `finger_color`.
     """
 
@@ -45,7 +45,7 @@ ROBOTS = {
         model="franka_panda/panda.urdf",
         base=(-0.1, 0.0, 0.0),
         home=(0.0, 0.1, 0.0, -2.2, 0.0, 2.3, 0.785),
-        hand_link=6,  # with the hand, which is fixed to it
+        hand_link=6,  # includes the hand, which is fixed to it
         finger_links=((7,), (8,)),
         gripper_joints=dict.fromkeys((7, 8), (0.0, 0.04, 10.0)),
         finger_yaw=np.pi / 4,
@@ -58,7 +58,7 @@ ROBOTS = {
         home=(0.0, 0.6, 0.0, -1.6, 0.0, 0.95, 0.0),
         hand_link=6,
         finger_links=((9, 10), (12, 13)),
-        # Joint 7 only holds the gripper. The tips (10, 13) are parallel when open and when closed on 5 cm.
+        # Joint 7 connects the arm and the gripper. The tips (10, 13) are parallel when open and when closed on 5 cm.
         gripper_joints={
             7: (0.0, 0.0, 100.0),
             8: (0.045, -0.195, 2.5),
@@ -69,6 +69,8 @@ ROBOTS = {
         finger_yaw=np.pi,
         arm_force=240.0,
         hand_from_tool=(0.0, 0.022, 0.267),
-        joint_limits={3: (-2.4, 2.4)},  # the model's 120 degrees keep the gripper from the workspace's near edge
+        joint_limits={
+            3: (-2.4, 2.4)
+        },  # with the model's 120 degrees the gripper cannot reach the workspace's near edge
     ),
 }

@@ -1,4 +1,4 @@
-"""A PyBullet world with a table at z = 0 and one arm over a workspace."""
+"""A PyBullet simulation of a table at z = 0, one robot arm and a workspace."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from symview_sim.robots import RobotSpec
 from symview_sim.shapes import Part, Vector
 
 GRAVITY = -9.81
-SETTLE_STEPS = 20  # objects are placed where they rest
-SOLVER_ITERATIONS = 20  # Bullet's 50 take twice as long, and the experts succeed as often
+SETTLE_STEPS = 20  # few, because objects are placed at rest
+SOLVER_ITERATIONS = 20  # Bullet's default of 50 takes twice as long, and the experts succeed as often
 MARKING_HEIGHT = 0.001  # metres
 DRAWER_MASS, DRAWER_FRICTION = 0.5, 1.0  # kg, N
 REACH_MARGIN = 0.05  # metres
@@ -27,11 +27,11 @@ Color = tuple[float, float, float]
 
 
 class Scene:
-    """One simulator, private to its owner: every call carries its client id, so scenes do not disturb each other.
+    """One PyBullet simulation. Scenes in one process are independent: every call passes the client's id.
 
     Args:
-        robot: which arm.
-        workspace: where the task takes place.
+        robot: the robot arm.
+        workspace: the working area of the task.
     """
 
     def __init__(self, robot: RobotSpec, workspace: Workspace):
@@ -44,24 +44,27 @@ class Scene:
         ground = self.client.createMultiBody(0, self.client.createCollisionShape(pybullet.GEOM_PLANE))
         self.client.changeVisualShape(ground, -1, rgbaColor=[1, 1, 1, 0])
         self.arm = Arm(self.client, robot)
-        self.arm.pass_through(ground)  # no arm reaches under the table; testing it takes a quarter of a step
+        self.arm.pass_through(ground)  # no arm reaches under the table; the collision test takes a quarter of a step
         self._fixtures: int = self.client.getNumBodies()
-        # The first step ever taken leaves traces in the solver. With it behind, episodes are bit-identical in whichever
-        # order they are simulated (test_env.py).
+        # The first simulation step leaves a state in the solver. After it, episodes are bit-identical in whatever order
+        # they are simulated (test_env.py).
         self.client.stepSimulation()
 
     def reset(self, gripper_position: Array, gripper_yaw: float) -> None:
-        """Clear the table and put the gripper, open, at `gripper_position` (3,) metres, world frame.
+        """Remove all objects and put the open gripper at `gripper_position` (3,) metres, world frame.
 
-        The arm stays loaded, which is what takes long; objects are made anew, since moving them would leave contact
-        caches behind.
+        The arm stays loaded, because loading takes long. Tasks create new objects, because contact caches would remain
+        if old ones were moved.
         """
         for index in reversed(range(self._fixtures, self.client.getNumBodies())):
             self.client.removeBody(self.client.getBodyUniqueId(index))
         self.arm.reset(gripper_position, gripper_yaw)
 
     def add_box(self, size: Vector, mass: float, friction: float, color: Color, position: Vector, yaw: float) -> int:
-        """Add a box of `size` (3,) metres with its centre at `position` (3,); return its body id."""
+        """Add a box of `size` (3,) metres with its centre at `position` (3,) metres; return its body id.
+
+        Mass in kg, friction coefficient, RGB colour in [0, 1], yaw in rad.
+        """
         half_extents = [side / 2 for side in size]
         body = self.client.createMultiBody(
             mass,
@@ -74,7 +77,7 @@ class Scene:
         return int(body)
 
     def add_marking(self, side: float, color: Color, place: Array) -> int:
-        """Paint a square of `side` metres on the table around `place` (2,), seen and not felt; return its body id."""
+        """Add a visible square of `side` metres, without contacts, centred at `place` (2,) metres; return its id."""
         half_extents = [side / 2, side / 2, MARKING_HEIGHT / 2]
         shape = self.client.createVisualShape(pybullet.GEOM_BOX, halfExtents=half_extents, rgbaColor=[*color, 1.0])
         return int(self.client.createMultiBody(0, -1, shape, [*np.asarray(place).tolist(), MARKING_HEIGHT / 2]))
@@ -117,16 +120,16 @@ class Scene:
         return int(body)
 
     def settle(self) -> None:
-        """Let freshly placed objects come to rest."""
+        """Simulate until new objects have come to rest, 20 steps."""
         self.wait(SETTLE_STEPS)
 
     def wait(self, steps: int) -> None:
-        """Let simulated time pass."""
+        """Simulate `steps` steps of 1/240 s."""
         for _ in range(steps):
             self.client.stepSimulation()
 
     def opening(self, cabinet: int) -> float:
-        """Return how far a drawer is open, metres."""
+        """Return the opening of a cabinet's drawer, metres."""
         return float(self.client.getJointState(cabinet, 0)[0])
 
     def touch(self, body: int, other: int) -> bool:
@@ -134,7 +137,7 @@ class Scene:
         return bool(self.client.getContactPoints(body, other))
 
     def gap(self, body: int, other: int, longest: float) -> float:
-        """Return the distance between two bodies' surfaces, metres; `longest` if it is more."""
+        """Return the distance between two bodies' surfaces, at most `longest`, metres."""
         points = self.client.getClosestPoints(body, other, longest)
         return min((float(point[8]) for point in points), default=longest)
 
@@ -177,10 +180,10 @@ class Scene:
         return int(collision), int(visual)
 
     def pose(self, body: int) -> tuple[Array, float]:
-        """Return a body's position (3,) in metres and its yaw in radians."""
+        """Return a body's position (3,), world frame, metres, and its yaw, rad."""
         position, orientation = self.client.getBasePositionAndOrientation(body)
         return np.array(position), float(self.client.getEulerFromQuaternion(orientation)[2])
 
     def close(self) -> None:
-        """Disconnect from the simulator."""
+        """End the simulation."""
         self._disconnect()

@@ -1,4 +1,4 @@
-"""What an environment is made from, and where its demonstrations are: plain settings that start no simulator."""
+"""Settings of an environment and the location of its demonstrations. Importing them starts no simulator."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from lerobot_symview.datasets.hub import HubOptions
-from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec, top_camera
+from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import DatasetLocation
 from symview_sim.robots import ROBOTS
@@ -16,56 +17,74 @@ if TYPE_CHECKING:
     from symview_sim.env import SymviewEnv
 
 
-@dataclass(frozen=True)
+# Not frozen, because the plugin's environment configuration derives from this class and from LeRobot's EnvConfig, which
+# is not frozen, and Python forbids mixing the two. Do not change an instance: a worker process looks up its environment
+# by the hash of the settings.
+@dataclass(unsafe_hash=True)
 class EnvSettings:
-    """A task, an arm and what is seen of them."""
+    """A task, a robot arm, the workspace and the cameras of an environment.
+
+    Raises:
+        ValueError: if the task or robot is unknown, two cameras have the same name, a camera is named like the depth or
+            a view of another one, or a number is out of range.
+    """
 
     task: str = "block_picking"
-    """Which task."""
+    """The task, such as `block_picking`."""
     robot: str = "panda"
-    """Which arm, `panda` or `kuka`."""
+    """The robot arm, `panda` or `kuka`."""
     camera: CameraSpec = field(default_factory=CameraSpec)
-    """Where the camera stands."""
+    """The first camera: pose, image size and depth sensor."""
     more_cameras: tuple[CameraSpec, ...] = ()
     """Further cameras, such as `[{name: left, azimuth_deg: 90}]`."""
     oracle: bool = False
     """Add the camera `top`, which looks straight down and does not see the arm."""
     depth: bool = True
-    """Record depth."""
+    """Add each camera's depth image, in metres."""
     segmentation: bool = False
-    """Record which pixel shows table, robot or which object."""
+    """Add each camera's segmentation: 0 table, 1 robot, 2 and up the objects."""
+    workspace: Workspace = field(default_factory=Workspace)
+    """The working area on the table."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
     max_steps: int = 50
     """Actions per episode."""
 
     def __post_init__(self) -> None:
+        self.check()
+
+    def check(self) -> None:
+        """Raise a ValueError unless the settings describe an environment."""
         check_task(self.task)
         lookup("robot", self.robot, ROBOTS)
         if self.start_jitter < 0:
-            raise ValueError(f"--env.start_jitter must not be negative, got {self.start_jitter}")
+            raise ValueError(f"start_jitter must not be negative, got {self.start_jitter}")
         if self.max_steps < 1:
-            raise ValueError(f"--env.max_steps must be at least 1, got {self.max_steps}")
+            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}")
+        names = [spec.name for spec in self.all_cameras]
+        if len(set(names)) < len(names):
+            raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
+        for name in names:
+            longer = [other for other in names if other.startswith(f"{name}_")]
+            if longer:
+                raise ValueError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
+
+    @property
+    def all_cameras(self) -> tuple[CameraSpec, ...]:
+        """The first camera, the further ones and, with `oracle`, the camera `top`."""
+        oracle = (top_camera(self.camera.height, self.workspace),) if self.oracle else ()
+        return (self.camera, *self.more_cameras, *oracle)
 
     def make(self) -> SymviewEnv:
-        """Return the environment; this imports PyBullet."""
+        """Return a new environment. PyBullet is imported only now."""
         from symview_sim.env import SymviewEnv
 
-        return SymviewEnv(
-            self.task,
-            robot=self.robot,
-            cameras=(self.camera, *self.more_cameras),
-            oracle=self.oracle,
-            depth=self.depth,
-            segmentation=self.segmentation,
-            start_jitter=self.start_jitter,
-            max_steps=self.max_steps,
-        )
+        return SymviewEnv(self)
 
 
 @dataclass(frozen=True)
 class RecordedDataset(DatasetLocation):
-    """Where demonstrations are."""
+    """Location of recorded demonstrations."""
 
     repo_id: str = "symview/demonstrations"
     """`user/name`, its name on the Hub."""
@@ -73,4 +92,4 @@ class RecordedDataset(DatasetLocation):
 
 @dataclass(frozen=True)
 class NewDataset(HubOptions, RecordedDataset):
-    """Where demonstrations go."""
+    """Location of new demonstrations, and options of a push to the Hub."""

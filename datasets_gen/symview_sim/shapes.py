@@ -1,4 +1,4 @@
-"""Bodies that no asset package has, built from boxes and cylinders: a bowl, a cabinet and its drawer."""
+"""Bodies built from boxes and cylinders: a bowl, a cabinet and its drawer."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ import numpy as np
 
 Vector = tuple[float, float, float]
 WALL = 0.006  # metres
-# Metres from the cabinet's origin to the handle bar's centre, drawer closed: 6.5 cm before its front, since the hand is
-# six centimetres thick.
+# Metres from the cabinet's origin to the centre of the handle bar of the closed drawer. The bar is 6.5 cm in front of
+# the drawer, because the hand is 6 cm thick.
 HANDLE_REACH = 0.170
 BOWL_WALLS = 12  # PyBullet crashes at more than 16 parts
 
 
 @dataclass(frozen=True)
 class Part:
-    """One convex piece of a body, in the body's frame; `euler` are its fixed-axis angles about x, y, z.
+    """One convex part of a body, in the body's frame.
 
-    A box has `size` along x, y, z; a cylinder, whose axis is z, has `size` (diameter, diameter, length).
+    Args:
+        size: metres: of a box along x, y, z; of a cylinder about z (diameter, diameter, length).
+        position: of the centre, metres.
+        euler: fixed-axis angles about x, y, z, rad.
+        is_cylinder: whether the part is a cylinder rather than a box.
     """
 
     size: Vector
@@ -28,7 +32,7 @@ class Part:
 
 
 def bowl_parts(floor_radius: float = 0.045, rim_radius: float = 0.075, height: float = 0.062) -> list[Part]:
-    """Return a round floor and twelve slanting walls; origin on the table under the centre, metres."""
+    """Return the parts of a bowl: a round floor and twelve slanted walls. Metres; origin at the bottom centre."""
     parts = [Part((2 * floor_radius, 2 * floor_radius, WALL), (0.0, 0.0, WALL / 2), is_cylinder=True)]
     rise, run = height - WALL / 2, rim_radius - floor_radius
     slant = np.arctan2(run, rise)
@@ -42,7 +46,7 @@ def bowl_parts(floor_radius: float = 0.045, rim_radius: float = 0.075, height: f
 
 
 def cabinet_parts(depth: float = 0.213, width: float = 0.228, height: float = 0.108) -> list[Part]:
-    """Return the five panels of a cabinet open at -x; origin on the table under its centre."""
+    """Return the five panels of a cabinet that is open at -x. Metres; origin at the bottom centre."""
     return [
         Part((depth, width, WALL), (0.0, 0.0, WALL / 2)),
         Part((depth, width, WALL), (0.0, 0.0, height - WALL / 2)),
@@ -53,7 +57,7 @@ def cabinet_parts(depth: float = 0.213, width: float = 0.228, height: float = 0.
 
 
 def drawer_parts(side: float = 0.2, height: float = 0.088) -> list[Part]:
-    """Return a drawer's five panels and its handle, a bar on two posts; origin under its centre, as the cabinet's."""
+    """Return the parts of a drawer, five panels and a handle bar on two posts. Metres; origin as the cabinet's."""
     middle, front = 0.054, -0.105
     center = front + side / 2
     bar = 0.015

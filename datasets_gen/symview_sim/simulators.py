@@ -1,7 +1,7 @@
-"""Simulators in processes of their own, whose observations come with the views that a policy sees.
+"""Simulators in separate processes. Their observations include the views that a policy uses.
 
-A worker process imports no LeRobot and no PyTorch. What happens in it follows from the seeds and actions it is sent, so
-that a worker that died, or that ran in an earlier session, is brought back to where it was by sending them again.
+A worker process imports neither LeRobot nor PyTorch. Its state follows from the seeds and actions that it receives:
+sending them again restores the state of a worker that died or that ran in an earlier session.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from lerobot_symview.geometry.camera import stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, ViewSpec
-from symview_sim.env import Observation as RawObservation
+from symview_sim.env import EnvObservation as RawObservation
 from symview_sim.env import SymviewEnv, named_features
 from symview_sim.settings import EnvSettings
 
 logger = logging.getLogger(__name__)
 
 Observation = dict[str, NDArray[Any]]
-"""Named as in a dataset: images (H, W, C), uint8 or float32 metres, and vectors."""
+"""Values by dataset key: images (H, W, C), uint8 or float32 metres, and vectors."""
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What is simulated, and what of it is reported."""
+    """The environment to simulate and the features to report."""
 
     env: EnvSettings
     """The environment."""
@@ -56,7 +56,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Reset:
-    """Begin an episode, and take actions that were taken before."""
+    """Begin an episode and repeat the actions taken so far."""
 
     seed: int
     actions: tuple[NDArray[np.floating], ...] = ()
@@ -64,7 +64,7 @@ class Reset:
 
 @dataclass(frozen=True)
 class Step:
-    """Take an action; should it end the episode, begin the next one from a seed, if there is one."""
+    """Take an action. If it ends the episode, begin the next one from `next_seed`, unless that is None."""
 
     action: NDArray[np.floating]
     next_seed: int | None
@@ -72,28 +72,28 @@ class Step:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a command."""
+    """The result of a command."""
 
     observation: Observation | None
-    """What to act upon next; None after an episode's end without a next one."""
+    """The observation for the next action; None if the episode has ended and no other follows."""
     last: Observation | None = None
-    """What the episode ended with, if it ended."""
+    """The last observation of an episode that has ended, else None."""
     reward: float = 0.0
     terminated: bool = False
-    """Whether the episode came to its end, by success or otherwise, rather than to the limit of its length."""
+    """Whether the episode ended by success or failure, rather than by its maximum length."""
     success: bool = False
     lost: bool = False
-    """Whether the simulator died: the command had no effect, and an episode from `next_seed` has begun instead."""
+    """Whether the simulator died. The command had no effect; an episode from `next_seed` has begun instead."""
     seconds: float = 0.0
-    """Time that the simulator took."""
+    """Time that the simulator took, seconds."""
 
 
 class Simulators:
-    """Several simulators; commands are sent to all before any is waited for.
+    """Several simulators that run in parallel: send a command to each, then receive each result.
 
     Args:
-        observed: what each simulates.
-        count: how many.
+        observed: environment and features of each simulator.
+        count: number of simulators.
     """
 
     def __init__(self, observed: Observed, count: int):
@@ -114,30 +114,30 @@ class Simulators:
 
     @property
     def process_ids(self) -> list[int]:
-        """The processes that simulate."""
+        """Process ids of the simulators."""
         return [process.pid or 0 for process, _ in self._workers]
 
     def cpu_seconds(self) -> float:
-        """Return the processor time that all of them have taken."""
+        """Return the CPU time that all simulators have used, seconds."""
         used = [psutil.Process(process_id).cpu_times() for process_id in self.process_ids]
         return float(sum(times.user + times.system for times in used))
 
     def is_alive(self, index: int) -> bool:
-        """Whether a simulator's process runs."""
+        """Whether a simulator's process is running."""
         return bool(self._workers[index][0].is_alive())
 
     def send(self, index: int, command: Reset | Step) -> None:
-        """Have a simulator begin; `receive` must follow before the next command."""
+        """Send a command to a simulator. Call `receive` before the next command."""
         seed = command.seed if isinstance(command, Reset) else command.next_seed
         self._spare_seeds[index] = 0 if seed is None else seed
-        with suppress(BrokenPipeError, ConnectionResetError):  # it died, as `receive` finds out
+        with suppress(BrokenPipeError, ConnectionResetError):  # it died; `receive` handles this
             self._workers[index][1].send(command)
 
     def receive(self, index: int) -> Outcome:
-        """Wait for what came of the last command.
+        """Wait for the result of the last command. A simulator that has died is replaced.
 
         Raises:
-            CommandError: if a simulator that was started in place of one that died dies too.
+            CommandError: if the replacement dies too.
         """
         with suppress(EOFError, ConnectionResetError):
             return self._workers[index][1].recv()
@@ -145,7 +145,9 @@ class Simulators:
         connection.close()
         process.join()
         logger.warning(
-            "simulator %d died (exit code %s): its episode is lost, another takes its place", index, process.exitcode
+            "simulator %d died (exit code %s): its episode is lost, a new simulator replaces it",
+            index,
+            process.exitcode,
         )
         self._workers[index] = self._start()
         try:
@@ -158,7 +160,7 @@ class Simulators:
         return Outcome(begun.observation, lost=True)
 
     def close(self) -> None:
-        """End all processes."""
+        """Stop all processes."""
         for process, connection in self._workers:
             connection.close()
             process.join(timeout=5)
@@ -177,15 +179,15 @@ class Simulators:
 
 @contextmanager
 def _unseen_main() -> Iterator[None]:
-    """Keep processes from importing the program that starts them, which takes a trainer's seconds in each of them."""
+    """Prevent new processes from importing the main program, which takes several seconds for a trainer."""
     main = sys.modules["__main__"]
     with patch.object(main, "__file__", None, create=True), patch.object(main, "__spec__", None, create=True):
         yield
 
 
 def _simulate(connection: Connection, observed: Observed) -> None:
-    """Carry out commands until the other end is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that trains, which ends this one
+    """Execute commands until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the training process, which stops this one
     env = observed.env.make()
     views = [spec.make() for spec in observed.views]
     workspace = parse_workspace(observed.workspace)

@@ -6,7 +6,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot_policy_symview import SymviewEnvConfig
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim import TASK_NAMES
-from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 
 SMALL = CameraSpec(height=32, width=48)
 
@@ -71,7 +71,7 @@ def test_all_tasks_or_a_list_are_one_suite():
 def test_environments_in_processes_of_their_own_see_the_same_and_freeze_when_done():
     config = SymviewEnvConfig(camera=SMALL)
     asynchronous = config.create_envs(2, use_async_envs=True)["block_picking"][0]
-    expected = [SymviewEnv("block_picking", cameras=(SMALL,)) for _ in range(2)]
+    expected = [EnvSettings("block_picking", camera=SMALL).make() for _ in range(2)]
     seen, _ = asynchronous.reset(seed=[5, 6])
     shown = [env.reset(seed=seed)[0] for env, seed in zip(expected, (5, 6), strict=True)]
     still = np.array([0, 0, 0, 0, 1], dtype=np.float32)

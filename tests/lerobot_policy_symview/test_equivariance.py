@@ -20,7 +20,7 @@ from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.views import ViewSpec
-from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
 BROKEN = [method for method in METHODS if method.endswith("_broken")]
@@ -186,7 +186,7 @@ def test_every_orientation_in_the_state_turns_along(state, gripper_input):
 @pytest.fixture(scope="module")
 def raw():
     """What a simulator delivers, without views."""
-    env = SymviewEnv("block_picking")
+    env = EnvSettings("block_picking").make()
     observation, _ = env.reset(seed=3)
     env.close()
     batched = {

@@ -17,7 +17,6 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view
 from lerobot_symview.views.reprojection import INFILLS
 from symview_sim.demonstration import episode_seed
-from symview_sim.env import SymviewEnv
 from symview_sim.settings import EnvSettings
 from tests.conftest import VIEW_SIZE
 from tests.helpers.policies import make_config
@@ -29,7 +28,7 @@ REPROJ = {"name": "reproj", "size": VIEW_SIZE}
 @pytest.fixture(scope="module")
 def observed():
     """A batch of one observation, as lerobot-eval hands it to the processors: the first frame of the recording."""
-    env = SymviewEnv("block_picking")
+    env = EnvSettings("block_picking").make()
     observation, _ = env.reset(seed=episode_seed(0, 0))
     env.close()
     batched = {

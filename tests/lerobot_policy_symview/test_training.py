@@ -7,7 +7,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
-from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 from tests.helpers.training import train
 
 
@@ -19,7 +19,7 @@ def test_every_method_is_trained_saved_loaded_and_acts(method, with_views, tmp_p
     assert policy.workspace.size == 0.4
     assert float(policy.action_width[0]) == float(policy.action_width[1]) > 0
     preprocess, postprocess = make_pre_post_processors(policy.config, str(checkpoint))
-    env = SymviewEnv("block_picking", oracle=method == "oracle_equi")
+    env = EnvSettings("block_picking", oracle=method == "oracle_equi").make()
     observation, _ = env.reset(seed=7)
     env.close()
     batch = {keys.STATE: torch.from_numpy(observation["agent_pos"])[None]}

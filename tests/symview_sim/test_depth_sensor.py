@@ -13,7 +13,7 @@ def test_noise_grows_with_the_square_of_the_depth(metres):
     assert measured.mean() == pytest.approx(metres, abs=1e-4)
 
 
-def test_pixels_are_lost_ten_times_as_often_beside_a_jump():
+def test_dropout_is_ten_times_as_frequent_beside_a_discontinuity():
     depth = np.full((300, 300), 1.0, dtype=np.float32)
     depth[:, 150:] = 0.9
     lost = degrade(depth, noise=0.0, dropout=0.03, rng=np.random.default_rng(0)) == 0
@@ -27,6 +27,6 @@ def test_pixels_are_lost_ten_times_as_often_beside_a_jump():
     )
 
 
-def test_what_is_not_measured_stays_so():
+def test_invalid_depth_stays_invalid():
     depth = np.zeros((20, 20), dtype=np.float32)
     assert not degrade(depth, noise=0.1, dropout=0.1, rng=np.random.default_rng(0)).any()

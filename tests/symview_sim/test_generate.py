@@ -18,9 +18,8 @@ from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.runtime.cli import CommandError
 from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
-from symview_sim.env import SymviewEnv
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import NewDataset
+from symview_sim.settings import EnvSettings, NewDataset
 from tests.conftest import EPISODES
 from tests.helpers.files import largest_file
 
@@ -36,7 +35,7 @@ def config(root, **options):
 
 
 def assert_same_data(folder, other):
-    """The same tables and bytes; Hugging Face's datasets write a hash of the folder's name into a table's metadata."""
+    """Compare tables by value, since their metadata contains a hash of the folder's name, and other files by bytes."""
     files, others = ({p.relative_to(f) for p in f.rglob("*") if p.is_file()} for f in (folder, other))
     assert files == others
     for file in files:
@@ -59,9 +58,9 @@ def reference(small_shards, tmp_path_factory):
     return generate(config(tmp_path_factory.mktemp("reference") / "data"))
 
 
-def test_the_dataset_holds_what_the_environment_showed(recorded):
+def test_the_dataset_contains_the_environments_observations(recorded):
     dataset = LeRobotDataset("test/recorded", root=recorded, depth_output_unit="m")
-    env = SymviewEnv("block_picking", oracle=True)
+    env = EnvSettings("block_picking", oracle=True).make()
     index = 0
     for episode in range(EPISODES):
         observation, _ = env.reset(seed=episode_seed(0, episode))
@@ -95,7 +94,7 @@ def test_every_episode_ends_in_success(recorded):
     assert all(dataset[i]["next.success"] for i in last)
 
 
-def test_cameras_are_a_choice_and_described(tmp_path):
+def test_cameras_are_configurable_and_described_in_the_metadata(tmp_path):
     front = CameraSpec("front", 64, 80, elevation_deg=50.0, spread=CameraSpread(azimuth_deg=180.0))
     left = CameraSpec("left", 48, 48, azimuth_deg=90.0)
     env = RecordedEnv(task="drawer_opening", camera=front, more_cameras=(left,), oracle=False, segmentation=True)
@@ -116,7 +115,7 @@ def test_cameras_are_a_choice_and_described(tmp_path):
     assert dataset.meta.features[keys.segmentation("left")]["info"]["symview"]["labels"]["1"] == "robot"
 
 
-def test_video_keeps_colour_exactly_and_depth_to_a_fifth_of_a_millimetre(tmp_path):
+def test_video_is_lossless_in_rgb_and_within_a_fifth_of_a_millimetre_in_depth(tmp_path):
     camera = CameraSpec(height=64, width=64, depth_noise=0.01, depth_dropout=0.1)
     env = RecordedEnv(camera=camera, segmentation=True)
     folder = generate(config(tmp_path / "data", env=env, num_episodes=1, video=True))
@@ -127,12 +126,12 @@ def test_video_keeps_colour_exactly_and_depth_to_a_fifth_of_a_millimetre(tmp_pat
     for index in range(len(dataset)):
         item = dataset[index]
         for key in dataset.meta.camera_keys:
-            stored, shown = item[key].permute(1, 2, 0).numpy(), episode[key][index]
-            if shown.dtype == np.uint8:
-                np.testing.assert_array_equal(np.rint(stored * 255), shown)
+            stored, expected = item[key].permute(1, 2, 0).numpy(), episode[key][index]
+            if expected.dtype == np.uint8:
+                np.testing.assert_array_equal(np.rint(stored * 255), expected)
             else:
-                assert np.abs(stored - shown)[shown <= recording.MAX_VIDEO_DEPTH].max(initial=0.0) < 2e-4
-                np.testing.assert_array_equal(stored[shown == 0], 0.0)
+                assert np.abs(stored - expected)[expected <= recording.MAX_VIDEO_DEPTH].max(initial=0.0) < 2e-4
+                np.testing.assert_array_equal(stored[expected == 0], 0.0)
     assert (episode[keys.depth("side")] == 0).any()
 
 
@@ -152,8 +151,8 @@ def test_a_ray_cluster_writes_the_same_data(reference, tmp_path):
     assert_same_data(generate(config(tmp_path / "data", num_workers=2, executor="ray")), reference)
 
 
-def test_a_disturbed_expert_is_repeated_until_it_succeeds(small_shards, tmp_path):
-    """Attempts are counted, and belong to the episode, not to the worker that makes them."""
+def test_an_expert_with_noise_repeats_until_it_succeeds(small_shards, tmp_path):
+    """The number of attempts depends on the episode, not on the worker."""
     folder = generate(config(tmp_path / "data", num_episodes=3, noise=0.9))
     facts = LeRobotDataset("test/small", root=folder).meta.features[keys.rgb("side")]["info"]["symview"]
     attempts = [demonstrate(SMALL, 0, episode, 0.9)[1] for episode in range(3)]
@@ -161,7 +160,7 @@ def test_a_disturbed_expert_is_repeated_until_it_succeeds(small_shards, tmp_path
     assert facts["expert_success_rate"] == pytest.approx(3 / sum(attempts))
 
 
-def test_a_full_disk_is_reported_and_the_recording_goes_on_later(reference, small_shards, tmp_path):
+def test_a_full_disk_is_reported_and_the_recording_can_be_resumed(reference, small_shards, tmp_path):
     root = tmp_path / "data"
     with largest_file(10_000), pytest.raises(CommandError, match=r"cannot write to .*MiB free.*--resume=true"):
         generate(config(root))
@@ -171,14 +170,14 @@ def test_a_full_disk_is_reported_and_the_recording_goes_on_later(reference, smal
     assert list(tmp_path.iterdir()) == [root]
 
 
-def test_an_image_that_lerobot_fails_to_write_is_noticed(small_shards, tmp_path):
+def test_a_failed_image_write_of_lerobot_is_reported(small_shards, tmp_path):
     plan = _begun(tmp_path, env=RecordedEnv(oracle=False))
     with largest_file(50_000), pytest.raises(CommandError, match=r"Error writing image .*side_depth"):  # of 92 kB
         recording.write_shard(plan, range(2))
     assert not plan.shard_folder(range(2)).exists()
 
 
-def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tmp_path):
+def test_an_interrupted_recording_needs_resume_and_the_same_request(small_shards, tmp_path):
     _begun(tmp_path)
     with pytest.raises(CommandError, match="add --resume=true"):
         generate(config(tmp_path / "data"))
@@ -188,7 +187,7 @@ def test_what_was_interrupted_needs_resume_and_the_same_request(small_shards, tm
         generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
 
 
-def test_what_an_interrupted_clean_up_left_is_not_adopted(small_shards, tmp_path):
+def test_leftovers_of_an_interrupted_clean_up_are_ignored(small_shards, tmp_path):
     plan = _begun(tmp_path)
     (plan.folder / "request.json").rename(plan.folder / "request.json.done")
     folder = generate(config(tmp_path / "data", num_episodes=1, seed=1))
@@ -196,7 +195,7 @@ def test_what_an_interrupted_clean_up_left_is_not_adopted(small_shards, tmp_path
     np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0)[0][keys.ACTION][0])
 
 
-def test_resuming_what_is_complete_does_nothing(reference):
+def test_resuming_a_complete_recording_does_nothing(reference):
     before = {path: path.stat().st_mtime_ns for path in reference.rglob("*")}
     assert generate(config(reference, resume=True)) == reference
     assert {path: path.stat().st_mtime_ns for path in reference.rglob("*")} == before
@@ -204,8 +203,8 @@ def test_resuming_what_is_complete_does_nothing(reference):
         generate(config(reference, resume=True, seed=1))
 
 
-def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monkeypatch):
-    """Two workers are killed during simulation, during writing, and whenever else the dice say."""
+def test_a_recording_killed_at_any_time_resumes_and_writes_the_same_data(tmp_path, monkeypatch):
+    """Two workers are killed during simulation, during writing and at random times."""
     root, partial = tmp_path / "data", tmp_path / "data.partial"
     command = [COMMAND, f"--root={root}", "--num_episodes=6", "--num_workers=2", "--resume=true"]
     command += ["--env.oracle=false", "--env.camera.height=32", "--env.camera.width=32", "--dataset.repo_id=test/small"]
@@ -234,7 +233,7 @@ def test_killed_at_any_moment_it_resumes_and_writes_the_same_data(tmp_path, monk
     assert_same_data(root, expected)
 
 
-def test_a_dead_worker_is_a_clear_error(small_shards, tmp_path):
+def test_a_dead_worker_raises_a_clear_error(small_shards, tmp_path):
     from lerobot_symview.runtime.executors import ProcessExecutor
 
     with (
@@ -256,13 +255,13 @@ def test_a_refused_request_leaves_nothing_behind(tmp_path):
 
 
 @pytest.mark.parametrize("options", [{"num_episodes": 0}, {"noise": 2.0}, {"seed": -1}, {"num_workers": 0}])
-def test_impossible_requests_are_refused(options):
+def test_invalid_options_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         GenerateConfig(NewDataset("a/b"), **options)
 
 
 def _begun(folder, **options):
-    """Begin a recording in `folder` and simulate two of its five episodes; return what workers are told."""
+    """Begin a recording in `folder`, simulate two of its five episodes and return its description for workers."""
     from symview_sim import generate as module
 
     plan = module._plan(config(folder / "data", **options), folder / "data")

@@ -1,4 +1,4 @@
-"""Simulators in processes of their own."""
+"""Simulators in separate processes."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ def assert_same(actual, expected):
         np.testing.assert_array_equal(actual[name], value)
 
 
-def test_observations_are_what_the_environment_and_the_view_say(simulators):
+def test_observations_equal_those_of_the_environment_and_the_view(simulators):
     from lerobot_symview.geometry.camera import stored_camera
     from lerobot_symview.geometry.workspace import Workspace
     from lerobot_symview.views import Frame, ReprojectedView
@@ -52,7 +52,7 @@ def test_observations_are_what_the_environment_and_the_view_say(simulators):
     np.testing.assert_array_equal(outcome.observation[keys.STATE], raw[keys.STATE])
 
 
-def test_an_episode_that_ends_is_followed_by_the_next(simulators):
+def test_the_next_episode_follows_the_end_of_an_episode(simulators):
     run(simulators, 0, Reset(1))
     outcomes = [run(simulators, 0, Step(ACTIONS[i], next_seed=2)) for i in range(3)]
     assert [outcome.last is not None for outcome in outcomes] == [False, False, True]
@@ -61,14 +61,14 @@ def test_an_episode_that_ends_is_followed_by_the_next(simulators):
     assert outcomes[-1].last[keys.STATE][0] != outcomes[-1].observation[keys.STATE][0]
 
 
-def test_without_a_next_seed_nothing_follows(simulators):
+def test_without_a_next_seed_no_episode_follows(simulators):
     run(simulators, 0, Reset(1))
     outcomes = [run(simulators, 0, Step(ACTIONS[i], next_seed=None)) for i in range(3)]
     assert outcomes[-1].observation is None
     assert outcomes[-1].last is not None
 
 
-def test_seed_and_actions_bring_a_simulator_to_the_same_place_whatever_it_did_before(simulators):
+def test_seed_and_actions_determine_a_simulators_state(simulators):
     run(simulators, 0, Reset(3))
     expected = [run(simulators, 0, Step(action, None)).observation for action in ACTIONS[:2]][-1]
     run(simulators, 1, Reset(99))
@@ -76,20 +76,20 @@ def test_seed_and_actions_bring_a_simulator_to_the_same_place_whatever_it_did_be
     assert_same(run(simulators, 1, Reset(3, tuple(ACTIONS[:2]))).observation, expected)
 
 
-@pytest.mark.parametrize("when", ["while waiting", "at work"])
-def test_a_simulator_that_dies_is_replaced_and_its_episode_lost(simulators, caplog, when):
+@pytest.mark.parametrize("when", ["idle", "busy"])
+def test_a_dead_simulator_is_replaced_and_its_episode_lost(simulators, caplog, when):
     run(simulators, 0, Reset(1))
     run(simulators, 1, Reset(1))
     before = simulators.process_ids
-    if when == "at work":
+    if when == "busy":
         simulators.send(0, Step(ACTIONS[0], next_seed=5))
     os.kill(before[0], signal.SIGKILL)
-    if when == "while waiting":
+    if when == "idle":
         while simulators.is_alive(0):
             pass
         simulators.send(0, Step(ACTIONS[0], next_seed=5))
     outcome = simulators.receive(0)
-    if when == "while waiting" or outcome.lost:  # at work it may have been faster than the signal
+    if when == "idle" or outcome.lost:  # a busy one may have finished before the signal
         assert outcome.lost
         assert "simulator 0 died (exit code -9)" in caplog.text
         assert simulators.process_ids[0] != before[0]
@@ -98,7 +98,7 @@ def test_a_simulator_that_dies_is_replaced_and_its_episode_lost(simulators, capl
     assert simulators.process_ids[1] == before[1]
 
 
-def test_one_that_always_dies_is_an_error():
+def test_a_simulator_that_dies_at_every_start_raises_an_error():
     broken = Observed(EnvSettings(), ("observation.images.nowhere",))
     with Simulators(broken, 1) as one:
         one.send(0, Reset(0))
@@ -106,7 +106,7 @@ def test_one_that_always_dies_is_an_error():
             one.receive(0)
 
 
-def test_ctrl_c_is_left_to_the_process_that_trains(simulators):
+def test_ctrl_c_does_not_stop_a_simulator(simulators):
     run(simulators, 0, Reset(1))
     os.kill(simulators.process_ids[0], signal.SIGINT)
     assert not run(simulators, 0, Step(ACTIONS[0], None)).lost

@@ -1,32 +1,48 @@
-"""The tasks: every module of this folder but `base` defines one, under its own name. A new task is a new file.
+"""The tasks. Each module of this folder except `base` defines one task, under the module's name.
 
-Other packages add theirs as entry points: in the group `symview.tasks`, name = "module:Class".
+Add a task of your own with a decorator, which makes it selectable in this process:
+
+```python
+from symview_sim.tasks import register_task
+from symview_sim.tasks.base import Task
+
+
+@register_task("my_task")
+class MyTask(Task): ...
+```
+
+Installed packages add tasks by an entry point in the group `symview.tasks`, such as `my_task = "my_package:MyTask"`.
+Worker processes (`--num_workers`, asynchronous evaluation, `symview-train-rl`) see entry points only.
 """
 
 from __future__ import annotations
 
-import importlib
 import pkgutil
 from typing import TYPE_CHECKING
 
-from lerobot_symview.registry import installed, lookup
+from lerobot_symview.registry import Registry
 
 if TYPE_CHECKING:
     from symview_sim.tasks.base import Task
 
 TASK_NAMES = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name != "base"))
+"""The built-in tasks."""
+
+TASKS: Registry[type[Task]] = Registry(
+    "task", "symview.tasks", {name: f"{__name__}.{name}:TASK" for name in TASK_NAMES}
+)
+register_task = TASKS.register
 
 
 def check_task(name: str) -> None:
-    """Raise ValueError, with the names there are, if there is no such task."""
-    if name not in TASK_NAMES:
-        lookup("task", name, dict.fromkeys((*TASK_NAMES, *installed("symview.tasks"))))
+    """Raise a ValueError that lists all tasks unless `name` is one of them."""
+    TASKS.check(name)
 
 
 def make_task(name: str) -> Task:
-    """Return a fresh task; its module is imported now, so that naming tasks does not start a simulator."""
-    check_task(name)
-    is_ours = name in TASK_NAMES
-    make = importlib.import_module(f"{__name__}.{name}").TASK if is_ours else installed("symview.tasks")[name].load()
-    task: Task = make()
-    return task
+    """Return a new instance of a task. Its module, and with it PyBullet, is imported only now.
+
+    Raises:
+        ValueError: if there is no such task.
+    """
+    return TASKS[name]()

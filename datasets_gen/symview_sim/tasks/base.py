@@ -1,4 +1,4 @@
-"""What a task is."""
+"""The interface of a task."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from symview_sim.scene import Scene
 
 
 class Task(ABC):
-    """One manipulation task: what lies on the table, when it is solved, and how an expert solves it.
+    """One manipulation task: its objects, its success condition and its scripted expert.
 
-    The module that defines it is named after the task and exports the class as `TASK`.
+    The module of a built-in task has the task's name and exports the class as `TASK`.
     """
 
     instruction: ClassVar[str]
+    """The task in words, which datasets store and language-conditioned policies read."""
 
     @abstractmethod
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Place the task's objects at random, all randomness from `rng`."""
+        """Add the task's objects at random poses. All randomness comes from `rng`."""
 
     @abstractmethod
     def is_success(self, scene: Scene) -> bool:
@@ -29,8 +30,8 @@ class Task(ABC):
 
     @abstractmethod
     def is_valid(self, scene: Scene) -> bool:
-        """Whether the task can still be solved; an episode ends when not."""
+        """Whether the task can still be solved. If not, the episode ends."""
 
     @abstractmethod
     def expert_action(self, scene: Scene) -> Array:
-        """Return the expert's action (5,) in the present state: dx, dy, dz (m), dyaw (rad), aperture."""
+        """Return the expert's action (5,) in the current state: dx, dy, dz (m), dyaw (rad), aperture in [0, 1]."""

@@ -1,4 +1,4 @@
-"""Block in bowl: put a cube into a bowl."""
+"""Block in bowl: place a cube in a bowl."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from symview_sim.tasks.base import Task
 EDGE = 0.05
 UPRIGHT = np.pi / 9
 INSIDE = 0.03  # metres between the cube's centre and the bowl's
-RELEASE = 0.1  # metres above the table at which the cube is let go
+RELEASE = 0.1  # metres above the table at which the cube is released
 TRAVEL = 0.15
 
 
 class BlockInBowl(Task):
-    """A red cube and a yellow bowl; solved when the cube lies in the upright bowl, let go of."""
+    """A red cube and a yellow bowl; solved when the cube lies in the upright bowl and is released."""
 
     instruction = "Put the red block into the bowl."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put both down, more than 17 cm apart."""
+        """Place the cube and the bowl more than 17 cm apart."""
         cube, bowl = random_places(rng, scene.workspace, paddings=(0.06, 0.085), distance=0.17)
         yaw = rng.uniform(-np.pi / 2, np.pi / 2)
         self._cube = scene.add_box((EDGE, EDGE, EDGE), 0.1, 1.0, (0.9, 0.1, 0.1), (*cube, EDGE / 2), yaw)
         self._bowl = scene.add_compound(bowl_parts(), 0.1, 1.0, (0.95, 0.8, 0.1), (*bowl, 0.0), 0.0)
 
     def is_success(self, scene: Scene) -> bool:
-        """Whether the cube lies in the bowl, and the bowl stands."""
+        """Whether the released cube lies in the bowl and the bowl is upright."""
         return self._lies_inside(scene) and scene.tilt(self._bowl) < UPRIGHT
 
     def is_valid(self, scene: Scene) -> bool:
-        """Whether both are where the gripper can reach them."""
+        """Whether the gripper can reach the cube and the bowl."""
         return scene.within_reach(self._cube) and scene.within_reach(self._bowl)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Grasp the cube, carry it over the bowl, let go of it."""
+        """Grasp the cube, carry it above the bowl and release it."""
         if self._lies_inside(scene):
             return np.append(LIFT, OPEN)
         if scene.arm.holds(self._cube):

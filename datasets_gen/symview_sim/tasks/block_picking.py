@@ -20,21 +20,21 @@ class BlockPicking(Task):
     instruction = "Pick up the red block."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put the cube down, uniformly in position and within a quarter turn of yaw."""
+        """Place the cube uniformly at random, its yaw within 45 degrees either way."""
         (place,) = random_places(rng, scene.workspace, paddings=(0.06,))
         yaw = rng.uniform(-np.pi / 4, np.pi / 4)
         self._cube = scene.add_box((EDGE, EDGE, EDGE), 0.1, 1.0, (0.9, 0.1, 0.1), (*place, EDGE / 2), yaw)
 
     def is_success(self, scene: Scene) -> bool:
-        """Whether the cube is held and lifted."""
+        """Whether the cube is grasped and lifted."""
         return scene.arm.position[2] > LIFTED and scene.arm.holds(self._cube)
 
     def is_valid(self, scene: Scene) -> bool:
-        """Whether the cube is where the gripper can reach it."""
+        """Whether the gripper can reach the cube."""
         return scene.within_reach(self._cube)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Go straight to the cube, close when there, lift once it is held."""
+        """Approach the cube in a straight line, close on arrival and lift it."""
         if scene.arm.holds(self._cube):
             return np.append(LIFT, CLOSED)
         return grasp(scene, self._cube, from_above=False)

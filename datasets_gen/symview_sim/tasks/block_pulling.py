@@ -14,7 +14,7 @@ SIZE = (0.08, 0.08, 0.05)
 BEHIND = 0.08  # metres behind the moved block where a sweep starts
 HEIGHT = 0.03
 TOUCHING = 0.002  # metres
-NEAR, GENTLE = 0.06, 0.02  # metres: closer than this to each other, blocks are moved in small steps
+NEAR, GENTLE = 0.06, 0.02  # metres: blocks that are closer than NEAR are moved in steps of GENTLE
 
 
 class BlockPulling(Task):
@@ -23,7 +23,7 @@ class BlockPulling(Task):
     instruction = "Pull the two blue blocks together."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put the blocks down, more than 13.6 cm apart."""
+        """Place the blocks more than 13.6 cm apart."""
         places = random_places(rng, scene.workspace, paddings=(0.068, 0.068), distance=0.136)
         yaws = rng.uniform(-np.pi / 2, np.pi / 2, size=2)
         self._blocks = [
@@ -32,17 +32,18 @@ class BlockPulling(Task):
         ]
 
     def is_success(self, scene: Scene) -> bool:
-        """Whether the blocks touch, or lie within two millimetres after touching while they moved."""
+        """Whether the gap between the blocks is below 2 mm: blocks may separate slightly after they touch."""
         return scene.gap(self._blocks[0], self._blocks[1], longest=0.01) < TOUCHING
 
     def is_valid(self, scene: Scene) -> bool:
-        """Whether both blocks are where the gripper can reach them."""
+        """Whether the gripper can reach both blocks."""
         return all(scene.within_reach(block) for block in self._blocks)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Sweep, open, through one block's far side to the other: the one there is room behind, else the nearer one.
+        """Sweep one block towards the other with an open gripper: the block with more free space behind it.
 
-        The blocks look alike, so which of them moves must follow from where they and the gripper are.
+        With equal space, sweep the block nearer to the gripper. The blocks look alike, so the choice must depend on the
+        positions of the blocks and the gripper alone.
         """
         places = [scene.pose(block)[0][:2] for block in self._blocks]
         options = []

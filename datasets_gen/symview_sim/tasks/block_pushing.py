@@ -1,4 +1,4 @@
-"""Block pushing: push a cube onto a painted square."""
+"""Block pushing: push a cube onto a marked square."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ class BlockPushing(Task):
     instruction = "Push the red block onto the blue square."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put the cube and the square down, more than 9 cm apart."""
+        """Place the cube and the square more than 9 cm apart."""
         cube, goal = random_places(rng, scene.workspace, paddings=(0.06, 0.065), distance=0.09)
         yaw = rng.uniform(-np.pi / 2, np.pi / 2)
         self._cube = scene.add_box((EDGE, EDGE, EDGE), 0.1, 1.0, (0.9, 0.1, 0.1), (*cube, EDGE / 2), yaw)
         self._goal = scene.add_marking(GOAL_EDGE, (0.1, 0.2, 0.9), goal)
 
     def is_success(self, scene: Scene) -> bool:
-        """Whether the cube is on the square."""
+        """Whether the cube's centre is within 5 cm of the square's."""
         cube, goal = scene.pose(self._cube)[0], scene.pose(self._goal)[0]
         return bool(np.linalg.norm((cube - goal)[:2]) < CLOSE)
 
     def is_valid(self, scene: Scene) -> bool:
-        """Whether the cube is where the gripper can reach it."""
+        """Whether the gripper can reach the cube."""
         return scene.within_reach(self._cube)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Sweep, half open, along the line from the cube to the square."""
+        """Sweep with a half-open gripper along the line from the cube to the square."""
         cube, goal = scene.pose(self._cube)[0][:2], scene.pose(self._goal)[0][:2]
         along = (goal - cube) / np.linalg.norm(goal - cube)
         start = scene.clip_to_workspace(cube - BEHIND * along)

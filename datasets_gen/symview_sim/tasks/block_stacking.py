@@ -6,25 +6,25 @@ import numpy as np
 
 from lerobot_symview.geometry.camera import Array
 from symview_sim.grasping import LIFT, OPEN, carry, grasp
-from symview_sim.motions import nearest_turn
+from symview_sim.motions import yaw_difference
 from symview_sim.placing import random_places
 from symview_sim.scene import Scene
 from symview_sim.tasks.base import Task
 
 EDGE = 0.05
-OFFSET = 0.025  # metres: a stack's centres differ by less, per axis
+OFFSET = 0.025  # metres, largest horizontal offset between the centres of stacked cubes per axis
 STABLE_STEPS = 100
-RELEASE = 1.15 * EDGE  # metres above the lower cube's centre at which the upper one is let go
+RELEASE = 1.15 * EDGE  # metres above the lower cube's centre at which the upper one is released
 TRAVEL = 0.16  # metres above the table at which a cube is carried
 
 
 class BlockStacking(Task):
-    """Two red cubes lie in the workspace; solved when one rests on the other, let go of and stable."""
+    """Two red cubes lie in the workspace; solved when one rests on the other, released and stable."""
 
     instruction = "Stack the red blocks."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put the cubes down, more than 12 cm apart."""
+        """Place the cubes more than 12 cm apart."""
         places = random_places(rng, scene.workspace, paddings=(0.06, 0.06), distance=0.12)
         self._cubes = [
             scene.add_box(
@@ -34,18 +34,18 @@ class BlockStacking(Task):
         ]
 
     def is_success(self, scene: Scene) -> bool:
-        """Whether a stack stands, nothing is held, and it still stands a hundred simulation steps later."""
+        """Whether a stack stands, no cube is grasped, and the stack still stands 100 simulation steps later."""
         if not self._stands(scene) or any(scene.arm.holds(cube) for cube in self._cubes):
             return False
         scene.wait(STABLE_STEPS)
         return self._stands(scene)
 
     def is_valid(self, scene: Scene) -> bool:
-        """Whether both cubes are where the gripper can reach them."""
+        """Whether the gripper can reach both cubes."""
         return all(scene.within_reach(cube) for cube in self._cubes)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Grasp the nearer cube, carry it over the other, let go of it and rise."""
+        """Grasp the nearer cube, carry it above the other, release it and rise."""
         if self._stands(scene):
             return np.append(LIFT, OPEN)
         held = [cube for cube in self._cubes if scene.arm.holds(cube)]
@@ -53,7 +53,7 @@ class BlockStacking(Task):
             (other,) = set(self._cubes) - {held[0]}
             base, yaw = scene.pose(other)
             goal = base + [0, 0, RELEASE]
-            return carry(scene, goal, nearest_turn(scene.arm.yaw, yaw, period=np.pi / 2), TRAVEL)
+            return carry(scene, goal, yaw_difference(scene.arm.yaw, yaw, period=np.pi / 2), TRAVEL)
         distances = [np.linalg.norm(scene.arm.position[:2] - scene.pose(cube)[0][:2]) for cube in self._cubes]
         return grasp(scene, self._cubes[int(np.argmin(distances))], from_above=True)
 

@@ -13,18 +13,18 @@ from symview_sim.tasks.base import Task
 
 OPENED = 0.15  # metres
 TRAVEL = 0.2  # metres: the drawer's end stop
-BEHIND = 0.028  # metres behind the bar's centre at which the fingers go down: the middle of the gap
-PULL, PULL_SPEED = 0.2, 0.04  # metres, and metres per action: slower than the fingers could
+BEHIND = 0.028  # metres behind the bar's centre, where the fingers descend: the middle of the gap
+PULL, PULL_SPEED = 0.2, 0.04  # metres, and metres per action: below the gripper's limit
 HEIGHT = 0.034
 
 
 class DrawerOpening(Task):
-    """A cabinet with one drawer stands anywhere, turned anyhow; solved when the drawer is 15 cm open."""
+    """A cabinet with one drawer stands at a random pose; solved when the drawer is 15 cm open."""
 
     instruction = "Open the drawer."
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
-        """Put the cabinet down so that its handle is near the middle, in any direction."""
+        """Place the cabinet in a random orientation, with its handle near the workspace's centre."""
         yaw = rng.uniform(0, 2 * np.pi)
         offset = rng.uniform([0.15, -0.10], [0.20, 0.10])
         rotation = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -36,11 +36,11 @@ class DrawerOpening(Task):
         return scene.opening(self._cabinet) > OPENED
 
     def is_valid(self, scene: Scene) -> bool:
-        """Always: the cabinet does not move."""
+        """Return True: the cabinet is fixed."""
         return True
 
     def expert_action(self, scene: Scene) -> Array:
-        """Go down behind the handle with closed fingers, then pull."""
+        """Descend behind the handle with closed fingers, then pull."""
         cabinet, yaw = scene.pose(self._cabinet)
         inward = np.array([np.cos(yaw), np.sin(yaw)])
         bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * inward

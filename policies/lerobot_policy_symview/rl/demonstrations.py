@@ -45,13 +45,16 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
     Raises:
         ValueError: naming the flags that differ.
     """
-    simulated = {spec.name: spec for spec in (env.camera, *env.more_cameras)}
+    simulated = {spec.name: spec for spec in env.all_cameras}
     if camera not in simulated:
         raise ValueError(f"--policy.camera={camera} is not simulated; --env.camera.name is {env.camera.name!r}")
     info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
     recorded = info.get("symview", {})
     flags = {"task": env.task, "robot": env.robot}
     pairs = {f"--env.{name}": (value, recorded[name]) for name, value in flags.items() if name in recorded}
+    for name, value in plain(asdict(env.workspace)).items():
+        if name in recorded.get("workspace", {}):
+            pairs[f"--env.workspace.{name}"] = (value, recorded["workspace"][name])
     for name, value in plain(asdict(simulated[camera])).items():
         if name in recorded.get("placement", {}):
             pairs[f"--env.camera.{name}"] = (value, recorded["placement"][name])

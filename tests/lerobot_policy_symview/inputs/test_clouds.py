@@ -12,7 +12,7 @@ from lerobot_policy_symview.nn.encoders.point_cloud import farthest_points, neig
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
-from symview_sim.env import SymviewEnv
+from symview_sim.settings import EnvSettings
 from tests.helpers.cameras import make_camera
 
 WORKSPACE = Workspace()
@@ -21,7 +21,7 @@ WORKSPACE = Workspace()
 @pytest.fixture(scope="module")
 def scene():
     """A rendered frame of block stacking and its calibration."""
-    env = SymviewEnv("block_stacking")
+    env = EnvSettings("block_stacking").make()
     observation, _ = env.reset(seed=3)
     env.close()
     return observation
