@@ -35,7 +35,7 @@ MILLIMETRE = 0.001
 
 @dataclass(frozen=True)
 class PreviewConfig:
-    """Show frames of a dataset: the camera's image with the workspace drawn in, the views, and the measured pixels.
+    """Show frames of a dataset: the camera's image with the workspace drawn in, the views and their masks.
 
     Writes a contact sheet (preview.png, preview.html) and, with rerun, preview.rrd. Warns about a camera that sees too
     little of the workspace, views with many inferred pixels, and a camera whose resolution is too low for the views.
@@ -192,7 +192,7 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
 def _is_wanted(config: PreviewConfig, view: View, features: Features) -> bool:
     """Whether to compute a view that --views does not name.
 
-    The dataset must have its inputs, and either lack the view or be shown with other options.
+    The dataset has its inputs, and either it lacks the view or a flag changes the view, its camera or its workspace.
     """
     if view.needs_depth and keys.depth(config.camera) not in features:
         return False
