@@ -11,9 +11,9 @@ from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
-from tests.hostile.files import change_feature
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
+from tests.malicious.files import change_feature
 
 pytestmark = pytest.mark.long
 

@@ -21,7 +21,7 @@ from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.helpers.cameras import make_camera
 from tests.helpers.policies import make_config
-from tests.hostile.files import (
+from tests.malicious.files import (
     DATA,
     DEPTH,
     EPISODES,

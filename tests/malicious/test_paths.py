@@ -5,7 +5,7 @@ import pytest
 
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_symview.runtime.cli import CommandError, DatasetTarget
-from tests.hostile.files import (
+from tests.malicious.files import (
     DATA,
     EPISODES,
     RGB,

@@ -8,7 +8,7 @@ from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_symview.calibration.file import read_calibration
 from lerobot_symview.geometry.camera import CalibrationError
 from lerobot_symview.runtime.cli import CommandError, DatasetTarget
-from tests.hostile.files import (
+from tests.malicious.files import (
     both_commands,
     change_info,
     derive,

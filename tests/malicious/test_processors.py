@@ -12,7 +12,7 @@ from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.helpers.policies import make_config
-from tests.hostile.files import change_json, load_with_processors
+from tests.malicious.files import change_json, load_with_processors
 
 
 def add_step(folder, step, name="policy_preprocessor.json"):

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview.calibration.file import read_calibration
 from lerobot_symview.runtime.cli import CommandError
-from tests.hostile.files import saved_replay
+from tests.malicious.files import saved_replay
 
 ROOT = Path(__file__).parents[2]
 

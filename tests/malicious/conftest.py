@@ -6,7 +6,7 @@ import pytest
 
 from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.helpers.policies import make_policy
-from tests.hostile.files import DATA
+from tests.malicious.files import DATA
 
 
 @pytest.fixture
