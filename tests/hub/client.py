@@ -26,7 +26,7 @@ def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iter
     user's token.
     """
 
-    class Delivery(httpx.HTTPTransport):
+    class RedirectTransport(httpx.HTTPTransport):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             url = hub.url + request.url.raw_path.decode()
             return super().handle_request(
@@ -37,7 +37,7 @@ def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iter
 
     def client() -> httpx.Client:
         hooks = {"request": [_http.hf_request_event_hook]}
-        return httpx.Client(transport=Delivery(), event_hooks=hooks, follow_redirects=True, timeout=None)
+        return httpx.Client(transport=RedirectTransport(), event_hooks=hooks, follow_redirects=True, timeout=None)
 
     with ExitStack() as stack:
         folder = cache or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="symview-hub-")))
