@@ -13,8 +13,8 @@ COMMANDS = {
     "symview-generate": "symview_sim.generate",
     "symview-add-views": "lerobot_symview.datasets.add_views",
     "symview-train-rl": "lerobot_policy_symview.rl.train_rl",
-    "symview-experiment": "symview_eval.experiments.experiment",
-    "symview-benchmark": "symview_eval.benchmarks.benchmark",
+    "symview-experiment": "symview_eval.experiments.cli",
+    "symview-benchmark": "symview_eval.benchmarks.cli",
 }
 MODULES = ", ".join([*COMMANDS.values(), "symview_eval.experiments.cells"])
 CHECK = f"import pybullet, {MODULES}; print(pybullet.isNumpyEnabled())"

@@ -1,1 +1,1 @@
-"""Experiments, reports and the demo."""
+"""Commands that show, measure and reproduce: preview, demo, doctor, benchmarks and experiments."""

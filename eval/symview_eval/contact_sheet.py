@@ -1,4 +1,4 @@
-"""Contact sheets: labelled images in rows, as a PNG and as an HTML page that stands alone."""
+"""Contact sheets: labelled images in rows, as a PNG image and as a self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from lerobot_symview.geometry.camera import Camera, project
 from lerobot_symview.geometry.workspace import Workspace
 
 TILE, GAP, LABEL = 228, 8, 24  # pixels
-OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)
-BORDER_POINTS = 32  # per side of the workspace: near a camera the image of a straight line still bends at the edges
+OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)  # RGB of the workspace's border on the table and at its height limit
+BORDER_POINTS = 32  # per side of the workspace; segments that reach behind the camera are not drawn
 
 
 @dataclass(frozen=True)
-class Row:
-    """One moment."""
+class SheetRow:
+    """One row of a contact sheet: the images of one frame."""
 
     title: str
-    """What it is."""
+    """Heading, such as the episode and frame number."""
     facts: list[str]
-    """What was measured."""
+    """Measurements to print under the heading."""
     images: dict[str, NDArray[np.uint8]] = field(repr=False)
-    """(H, W, 3) each, by name."""
+    """Label -> image (H, W, 3) uint8 RGB."""
 
 
-def montage(rows: list[Row]) -> Image.Image:
-    """Return one picture with the images of every row beside each other, enlarged and labelled."""
+def montage(rows: list[SheetRow]) -> Image.Image:
+    """Return the contact sheet as one image; every image is scaled to a tile and labelled."""
     columns = max(len(row.images) for row in rows)
     row_height = TILE + 2 * LABEL + 2 * GAP
     sheet = Image.new("RGB", (columns * (TILE + GAP) + GAP, len(rows) * row_height), "white")
@@ -47,20 +47,29 @@ def montage(rows: list[Row]) -> Image.Image:
     return sheet
 
 
-def page(title: str, rows: list[Row], warnings: list[str]) -> str:
-    """Return the same as an HTML page, with images at their own size, enlarged by the browser."""
+def page(title: str, rows: list[SheetRow], warnings: list[str]) -> str:
+    """Return the contact sheet as an HTML page; it embeds the images at their own size and the browser scales them."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    shown = [(row, [(name, png_uri(image)) for name, image in row.images.items()]) for row in rows]
-    return environment.get_template("preview.html").render(title=title, rows=shown, warnings=warnings, tile=TILE)
+    embedded = [(row, [(name, png_uri(image)) for name, image in row.images.items()]) for row in rows]
+    return environment.get_template("preview.html").render(title=title, rows=embedded, warnings=warnings, tile=TILE)
 
 
 def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -> NDArray[np.uint8]:
-    """Draw the workspace's border on the table (red) and at its height limit (yellow) into a camera's image."""
+    """Draw the workspace's border on the table (red) and at its height limit (yellow) into a camera's image.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        camera: the camera of the image.
+        workspace: the workspace.
+
+    Returns:
+        The image, enlarged by a whole number if it is small, (s H, s W, 3) uint8.
+    """
     scale = max(1, round(2 * TILE / max(rgb.shape[:2])))
-    picture = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
-    draw = ImageDraw.Draw(picture)
+    image = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
+    draw = ImageDraw.Draw(image)
     for height, color in ((workspace.height_limit, CEILING), (0.0, OUTLINE)):
         corners = workspace.corners(height)
         share = np.linspace(0, 1, BORDER_POINTS)[:, None]
@@ -70,11 +79,11 @@ def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -
         for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
             if near > 0 and far > 0:
                 draw.line([first, second], fill=color, width=max(2, scale))
-    return np.asarray(picture)
+    return np.asarray(image)
 
 
 def grey(metres: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Show (H, W) metres as (H, W, 3) uint8 from black, the least, to white."""
+    """Convert an (H, W) image in metres to grey levels (H, W, 3) uint8: its minimum is black, its maximum white."""
     low, high = float(metres.min()), float(metres.max())
     levels = np.rint(255 * (metres - low) / max(high - low, 1e-6)).astype(np.uint8)
     return np.repeat(levels[..., None], 3, axis=-1)
@@ -87,12 +96,13 @@ def png_uri(image: NDArray[np.uint8]) -> str:
     return data_uri("image/png", stream.getvalue())
 
 
-def data_uri(kind: str, content: bytes) -> str:
-    """Return content of a MIME type as a URI that holds it."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+def data_uri(mime_type: str, content: bytes) -> str:
+    """Return a data URI that embeds the content."""
+    return f"data:{mime_type};base64,{base64.b64encode(content).decode()}"
 
 
 def _tile(image: NDArray[np.uint8]) -> Image.Image:
+    """Scale an image so that its longer side has TILE pixels."""
     height, width = image.shape[:2]
     scale = TILE / max(height, width)
     size = (max(1, round(scale * width)), max(1, round(scale * height)))

@@ -1,4 +1,4 @@
-"""`symview-demo`: the whole pipeline on one task, from nothing to a report."""
+"""`symview-demo`: the whole pipeline on one task, from demonstrations to an HTML report."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ EXAMPLES = """\
 TASK = "block_picking"
 REPO_ID = f"symview/{TASK}"
 VIEWS_REPO_ID = f"{REPO_ID}_views"
-VIEW_SIZE = 76  # pixels: half the camera's, so that nearly every pixel of the view is seen by one of the camera
+VIEW_SIZE = 76  # pixels: half the camera image's, so that a camera pixel falls into nearly every pixel of the view
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Demonstrations, views, training, evaluation and a report, each by the command a user would type."""
+    """Record demonstrations, add views, train, evaluate and write a report, using the commands a user would type."""
 
     output_dir: Path = Path("outputs/demo")
-    """Folder for everything; a second run continues what an interrupted one left."""
+    """Folder for all files; a second run continues an interrupted one."""
     demonstrations: int = 20
-    """How many expert episodes to learn from."""
+    """Expert episodes to record and train on."""
     steps: int = 1200
     """Training steps."""
     batch_size: int = 16
     """Frames per training step."""
     eval_episodes: int = 50
-    """Episodes of the evaluation."""
+    """Evaluation episodes."""
     seed: int = 0
-    """Of the demonstrations and the training."""
+    """Seed of the demonstrations and the training."""
 
     def __post_init__(self) -> None:
         for name in ("demonstrations", "steps", "batch_size", "eval_episodes"):
@@ -47,7 +47,7 @@ class DemoConfig:
 
 
 def stages(config: DemoConfig) -> list[Stage]:
-    """Return the five commands of the pipeline."""
+    """Return the four commands of the pipeline."""
     folder = config.output_dir
     recorded, views, policy, evaluation = (folder / name for name in ("recorded", "views", "policy", "evaluation"))
     generate = (
@@ -60,7 +60,7 @@ def stages(config: DemoConfig) -> list[Stage]:
         "--num_workers=2",
         "--resume=true",
     )
-    # Only the views go into the training set: LeRobot decodes every image of a frame, wanted or not.
+    # Only the views go into the training set: LeRobot decodes every image of a frame, used or not.
     add_views = (
         "symview-add-views",
         f"--dataset.repo_id={REPO_ID}",
@@ -82,7 +82,7 @@ def stages(config: DemoConfig) -> list[Stage]:
 
 
 def train_command(config: DemoConfig, repo_id: str, dataset: Path, output: Path, *options: str) -> tuple[str, ...]:
-    """Return how the demo trains a policy: small, on a CPU; `options` say which."""
+    """Return the command that trains a small policy on a CPU; `options` are flags that choose the policy."""
     return (
         "lerobot-train",
         f"--dataset.repo_id={repo_id}",
@@ -107,7 +107,7 @@ def train_command(config: DemoConfig, repo_id: str, dataset: Path, output: Path,
 
 
 def evaluate_command(config: DemoConfig, policy: Path, output: Path) -> tuple[str, ...]:
-    """Return how the demo evaluates what `train_command` left in the folder `policy`."""
+    """Return the command that evaluates the policy that `train_command` wrote to the folder `policy`."""
     return (
         "lerobot-eval",
         f"--policy.path={policy / 'checkpoints' / 'last' / 'pretrained_model'}",
@@ -123,7 +123,7 @@ def evaluate_command(config: DemoConfig, policy: Path, output: Path) -> tuple[st
 
 def demo(config: DemoConfig) -> Path:
     """Run the pipeline and return the report's path."""
-    # Hugging Face's libraries are told to stay off the network, and their cache stays with the results.
+    # Hugging Face's libraries must not use the network, and their cache belongs to the results.
     environment = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str(config.output_dir.resolve() / "cache")}
     pipeline = stages(config)
     os.environ |= environment

@@ -1,4 +1,4 @@
-"""The demo's report: one HTML page that needs nothing beside it."""
+"""The demo's report: one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -16,57 +16,66 @@ from numpy.typing import NDArray
 
 from lerobot_symview.datasets.source import SourceDataset
 from symview_eval.contact_sheet import data_uri, png_uri
-from symview_eval.preview import read_moments
+from symview_eval.preview import read_samples
 from symview_eval.stages import Stage
 from symview_eval.statistics import SuccessRate
 
 LOSS_LINE = re.compile(r"step:\S+ .*?loss:(\S+)")
 LOG_INTERVAL = re.compile(r"'log_freq': (\d+)")
-MOMENT = 2  # frame of the first demonstration that is shown: the gripper is on its way, the arm in the picture
-SHOWN = {
+FRAME = 2  # frame of the first demonstration to show: the gripper is moving and the arm is in the image
+IMAGES = {
     "side": "side camera",
     "side_reproj": "reprojected (RGBD)",
     "side_persp": "perspective (RGB)",
-    "top": "oracle from above",
+    "top": "oracle (top-down camera)",
 }
 PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "numpy")
 
 
 @dataclass(frozen=True)
 class LossPoint:
-    """Training loss averaged over the steps since the last point, up to `step`."""
+    """Mean training loss over the steps from the previous point to `step`."""
 
     step: int
     loss: float
 
 
 def read_losses(log: Path) -> list[LossPoint]:
-    """Return the losses that `lerobot-train` logged, at the interval it logged too: it writes step 1230 as 1K."""
+    """Return the losses in a log of `lerobot-train`.
+
+    Steps are computed from the logged interval, since the log rounds them: step 1230 is written as 1K.
+    """
     text = log.read_text(errors="replace")
     interval = int(LOG_INTERVAL.findall(text)[0])
     return [LossPoint(interval * (i + 1), float(loss)) for i, loss in enumerate(LOSS_LINE.findall(text))]
 
 
 def read_success(evaluation: Path) -> SuccessRate:
-    """Return the success rate that `lerobot-eval` wrote into its output folder."""
+    """Return the success rate in the output folder of `lerobot-eval`."""
     overall = json.loads((evaluation / "eval_info.json").read_text())["overall"]
     episodes = int(overall["n_episodes"])
     return SuccessRate(round(overall["pc_success"] / 100 * episodes), episodes)
 
 
 def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float]) -> None:
-    """Write the page `report` from what the stages left in its folder."""
+    """Write the page `report` from the results of the stages.
+
+    Args:
+        report: path of the page; its folder holds the stages' logs.
+        stages: the demo's four stages.
+        seconds: stage name -> seconds that it took.
+    """
     recorded, views, _, evaluation = (stage.result for stage in stages)
     images: dict[str, NDArray] = {}
     for folder in (recorded, views):
-        images |= read_moments(SourceDataset(folder), None, 0, [MOMENT])[0].stored
+        images |= read_samples(SourceDataset(folder), None, 0, [FRAME])[0].stored
     videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
     ).get_template("demo.html")
     page = template.render(
         success=read_success(evaluation),
-        moment=[(title, png_uri(images[name])) for name, title in SHOWN.items()],
+        images=[(title, png_uri(images[name])) for name, title in IMAGES.items()],
         videos=[data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
         chart=_loss_chart(read_losses(next((report.parent / "logs").glob("*-training.log")))),
         stages=[(stage, seconds[stage.name]) for stage in stages],
@@ -78,7 +87,7 @@ def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float
 
 
 def _loss_chart(points: Sequence[LossPoint]) -> str:
-    """Return an SVG data URI of the loss over steps, on a logarithmic axis."""
+    """Return an SVG data URI of the loss over training steps, on a logarithmic axis."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6.4, 2.8), layout="constrained")

@@ -1,4 +1,4 @@
-"""`symview-preview`: what a dataset's camera sees and what its views make of it, before or after they are added."""
+"""`symview-preview`: shows the camera's images and the views of a dataset, before or after the views are added."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
-from symview_eval.contact_sheet import Row, grey, montage, page, with_outline
+from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
 from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
@@ -30,24 +30,24 @@ EXAMPLES = """\
   symview-preview --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --episodes='[0, 7]' \\
       --reproj.source_scale=2 --output_dir=preview"""
 
-LATTICE = 9  # points per side of the workspace at which the camera's resolution is measured
+LATTICE = 9  # points per side of the workspace where the camera's resolution is measured
 MILLIMETRE = 0.001
 
 
 @dataclass(frozen=True)
 class PreviewConfig:
-    """Show moments of a dataset: the camera's image with the workspace, the views, what is seen and what inferred.
+    """Show frames of a dataset: the camera's image with the workspace drawn in, the views and their masks.
 
-    Writes preview.png, preview.html and, for `rerun`, preview.rrd, and warns about a camera that sees too little, views
-    with many holes, and a camera too coarse for them.
+    Writes a contact sheet (preview.png, preview.html) and, with rerun, preview.rrd. Warns about a camera that sees too
+    little of the workspace, views with many inferred pixels, and a camera whose resolution is too low for the views.
     """
 
     dataset: DatasetLocation
     """The dataset."""
     episodes: list[int] = field(default_factory=lambda: [0])
-    """Which episodes."""
+    """Episodes to show."""
     frames: int = 4
-    """How many moments of each, evenly spaced."""
+    """Frames per episode, evenly spaced in time."""
     camera: str = "side"
     """Camera that views are made from; a dataset that holds only views is shown as it is."""
     views: list[ViewSpec] | None = None
@@ -55,81 +55,90 @@ class PreviewConfig:
     options are stated. Stored ones are shown as they are.
     """
     size: int | None = None
-    """Rows and columns of all views, in place of each one's own."""
+    """Rows and columns of all views; by default each view's own."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
     calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
+    """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
     workspace: Workspace | None = None
-    """What the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by default what
-    `calibration` says, else the dataset, else the simulator's. The gripper's x and y count from its centre.
+    """Square of the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
+    default that of the calibration file, else the dataset's, else the simulator's. The gripper's x and y are relative
+    to its centre.
     """
     max_holes: float = 0.5
-    """Share of a reprojected view's pixels that may be inferred without a warning."""
+    """Fraction of a reprojected view's pixels that may be inferred before a warning is given."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
     """Write preview.rrd; by default if rerun is installed."""
     output_dir: Path = Path("preview")
-    """Folder of the files."""
+    """Folder for the files."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise ValueError(f"--frames must be at least 1, got {self.frames}")
         if not self.episodes:
-            raise ValueError("--episodes is empty, name at least one")
+            raise ValueError("--episodes is empty: give at least one, such as --episodes='[0]'")
         if not 0 <= self.max_holes <= 1:
             raise ValueError(f"--max_holes must lie in [0, 1], got {self.max_holes}")
 
 
 @dataclass(frozen=True)
-class Moment:
-    """A frame of a dataset: what views are made from, where the dataset has that, and what it stores."""
+class FrameSample:
+    """One frame of a dataset and its stored images."""
 
     episode: int
     index: int
     frame: Frame | None
+    """Input of the views; None for a dataset that stores only views."""
     stored: dict[str, NDArray]
-    """Every image, by name: colour (H, W, 3) uint8 or distances (H, W)."""
+    """Stored images by name: colour (H, W, 3) uint8, or depth or height (H, W) in metres."""
 
     @property
     def title(self) -> str:
-        """Which moment it is."""
+        """Episode and frame number."""
         return f"episode {self.episode}, frame {self.index}"
 
 
-def read_moments(source: SourceDataset, reader: FrameReader | None, episode: int, indices: list[int]) -> list[Moment]:
-    """Return some frames of an episode."""
+def read_samples(
+    source: SourceDataset, reader: FrameReader | None, episode: int, indices: list[int]
+) -> list[FrameSample]:
+    """Return the frames `indices` of an episode; without a reader, only their stored images."""
     table = EpisodeTables(source, source.data_file(episode)).read(episode)
     images = [key for key, feature in source.features.items() if feature["dtype"] in ("image", "video")]
-    moments = []
+    samples = []
     for index in indices:
         row = table.slice(index, 1)
         stored = {key.removeprefix(keys.rgb("")): next(source.images(key, episode, row)) for key in images}
-        moments.append(Moment(episode, index, next(reader.frames(episode, row)) if reader else None, stored))
-    return moments
+        samples.append(FrameSample(episode, index, next(reader.frames(episode, row)) if reader else None, stored))
+    return samples
 
 
 @dataclass(frozen=True)
 class Measures:
-    """What can be measured of one moment."""
+    """Measurements of one frame."""
 
     visible: float
-    """Share of the working volume in the camera's image."""
+    """Fraction of the working volume that lies in the camera's image."""
     resolution: float
-    """The camera's pixels per millimetre of the table, at the least."""
+    """Lowest resolution of the camera on the table, pixels per millimetre."""
     holes: dict[str, float]
-    """Share of each view's pixels that are inferred, where that is known."""
+    """Fraction of inferred pixels, of each view that has a mask."""
 
 
 def preview(config: PreviewConfig) -> Path:
-    """Write the files that `config` describes and return their folder."""
+    """Write the contact sheet and the recording, and return their folder.
+
+    Raises:
+        CommandError: if the dataset has no such episode.
+        ValueError: if it has no such camera.
+    """
     with flagged("--dataset"):
         source = SourceDataset(config.dataset.folder())
     total = len(source.episodes)
     unknown = [episode for episode in config.episodes if not 0 <= episode < total]
     if unknown:
-        raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0")
+        raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0 to {total - 1}")
     reader, views = _chosen(config, source)
     config.output_dir.mkdir(parents=True, exist_ok=True)
     recording = None
@@ -139,18 +148,18 @@ def preview(config: PreviewConfig) -> Path:
     for episode in tqdm(config.episodes, desc="preview", unit="episode"):
         length = source.episodes[episode]["length"]
         indices = np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist()
-        for moment in read_moments(source, reader, episode, indices):
-            if moment.frame is None or reader is None:
-                shown = {name: _shown(image) for name, image in moment.stored.items()}
-                rows.append(Row(moment.title, [], shown))
+        for sample in read_samples(source, reader, episode, indices):
+            if sample.frame is None or reader is None:
+                shown = {name: _displayable(image) for name, image in sample.stored.items()}
+                rows.append(SheetRow(sample.title, [], shown))
                 continue
-            made = _render(moment.frame, config.camera, views)
-            measures = _measure(moment.frame.camera, reader.workspace, made)
-            rows.append(_row(config.camera, moment, moment.frame, made, measures))
+            made = _render(sample.frame, config.camera, views)
+            measures = _measure(sample.frame.camera, reader.workspace, made)
+            rows.append(_row(config.camera, sample, sample.frame, made, measures))
             measured.append(measures)
             if recording is not None:
-                stored = {name: moment.stored[name] for name in _stored_views(source.features)}
-                recording.add(len(rows) - 1, config.camera, moment.frame, stored | made)
+                stored = {name: sample.stored[name] for name in _stored_views(source.features)}
+                recording.add(len(rows) - 1, config.camera, sample.frame, stored | made)
     if recording is not None:
         recording.close()
     warnings = _warnings(config, views, reader.workspace, measured) if reader is not None else []
@@ -185,22 +194,25 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
 
 
 def _is_wanted(config: PreviewConfig, view: View, features: Features) -> bool:
-    """Whether a view that is not asked for by name is made: the dataset has what it needs and does not store it."""
+    """Whether to compute a view that --views does not name.
+
+    The dataset has its inputs, and either it lacks the view or a flag changes the view, its camera or its workspace.
+    """
     if view.needs_depth and keys.depth(config.camera) not in features:
         return False
-    stated = (config.size, config.calibration, config.workspace)
-    asked = any(one is not None for one in stated) or view != type(view)()
-    return asked or not any(keys.view(config.camera, output) in features for output in view.outputs)
+    settings = (config.size, config.calibration, config.workspace)
+    has_options = any(setting is not None for setting in settings) or view != type(view)()
+    return has_options or not any(keys.view(config.camera, output) in features for output in view.outputs)
 
 
 def _stored_views(features: Features) -> list[str]:
-    """Return the names of the images that are views."""
+    """Return the names of the stored images that are views."""
     facts = {key: (feature.get("info") or {}).get("symview", {}) for key, feature in features.items()}
-    return [key.removeprefix(keys.rgb("")) for key, stated in facts.items() if "view" in stated]
+    return [key.removeprefix(keys.rgb("")) for key, fact in facts.items() if "view" in fact]
 
 
 def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDArray]:
-    """Return every output of the views, and the mask of those that have one, by name."""
+    """Return every output of the views by name, with the masks of the views that have one."""
     images: dict[str, NDArray] = {}
     for view in views.values():
         images |= view.with_mask().render(frame)
@@ -213,57 +225,58 @@ def _measure(camera: Camera, workspace: Workspace, made: dict[str, NDArray]) -> 
     return Measures(workspace.visible_fraction(camera), table_resolution(camera, workspace), holes)
 
 
-def _row(name: str, moment: Moment, frame: Frame, made: dict[str, NDArray], measures: Measures) -> Row:
+def _row(name: str, sample: FrameSample, frame: Frame, made: dict[str, NDArray], measures: Measures) -> SheetRow:
     offset = frame.camera.position - [*frame.workspace.center, 0.0]
     distance = float(np.linalg.norm(offset))
     elevation, azimuth = np.rad2deg([np.arcsin(offset[2] / distance), np.arctan2(offset[1], offset[0])])
     facts = [
         f"{name} at {elevation:.0f}° elevation, {azimuth:.0f}° azimuth, {distance:.2f} m",
-        f"sees {measures.visible:.0%} of the workspace at {measures.resolution:.2f} px/mm or more",
+        f"sees {measures.visible:.0%} of the workspace, at least {measures.resolution:.2f} px/mm",
         *(f"{share:.0%} of {view} inferred" for view, share in measures.holes.items()),
     ]
     outlined = {f"{name} and workspace": with_outline(frame.rgb, frame.camera, frame.workspace)}
-    others = {key: image for key, image in moment.stored.items() if key != name and not key.endswith("_depth")}
+    others = {key: image for key, image in sample.stored.items() if key != name and not key.endswith("_depth")}
     images = {}
     for key in others | made:
-        found = {origin: known[key] for origin, known in (("stored", others), ("computed", made)) if key in known}
-        for origin, image in found.items():
-            images[f"{key}, {origin}" if len(found) > 1 else key] = _shown(image)
-    return Row(moment.title, facts, outlined | images)
+        by_origin = {origin: known[key] for origin, known in (("stored", others), ("computed", made)) if key in known}
+        for origin, image in by_origin.items():
+            images[f"{key}, {origin}" if len(by_origin) > 1 else key] = _displayable(image)
+    return SheetRow(sample.title, facts, outlined | images)
 
 
 def _warnings(
     config: PreviewConfig, views: dict[str, View], workspace: Workspace, measured: list[Measures]
 ) -> list[str]:
-    """Say what is too little at some moment."""
+    """Return the warnings about the worst of the measured frames."""
     warnings = []
-    visible, resolution = (min(getattr(one, name) for one in measured) for name in ("visible", "resolution"))
+    visible, resolution = (min(getattr(measures, name) for measures in measured) for name in ("visible", "resolution"))
     if visible < MINIMUM_VISIBLE:
         warnings.append(
-            f"{config.camera} sees {visible:.0%} of the workspace, less than {MINIMUM_VISIBLE:.0%}: move or turn it"
+            f"camera {config.camera} sees {visible:.0%} of the workspace, less than {MINIMUM_VISIBLE:.0%}: "
+            "move or rotate the camera, or check --workspace and --calibration"
         )
     for name in measured[0].holes:
-        holes = max(one.holes[name] for one in measured)
+        holes = max(measures.holes[name] for measures in measured)
         if holes > config.max_holes:
             warnings.append(
-                f"{holes:.0%} of {name} is inferred, more than --max_holes={config.max_holes:g}: "
+                f"{holes:.0%} of the pixels of {name} are inferred, more than --max_holes={config.max_holes:g}: "
                 "raise the view's source_scale or lower --size"
             )
     for name, view in views.items():
-        asked = view.size * MILLIMETRE / workspace.size
-        if resolution < asked:
+        required = view.size * MILLIMETRE / workspace.size
+        if resolution < required:
             warnings.append(
-                f"{name} asks for {asked:.2f} px/mm and {config.camera} gives {resolution:.2f} where it gives least: "
-                f"--size={int(resolution * workspace.size / MILLIMETRE)} would show as much, "
-                "a nearer or finer camera more"
+                f"view {name} needs {required:.2f} px/mm, camera {config.camera} has {resolution:.2f} at worst: "
+                f"use --size={int(resolution * workspace.size / MILLIMETRE)}, "
+                "or a closer camera or one with a higher resolution"
             )
     return warnings
 
 
 def table_resolution(camera: Camera, workspace: Workspace) -> float:
-    """Return how many of the camera's pixels a millimetre of the table spans, where and along what it spans the least.
+    """Return the camera's lowest resolution on the table, over points and directions, pixels per millimetre.
 
-    Zero if a part of the table lies behind the camera.
+    It is zero if a part of the workspace lies behind the camera.
     """
     steps = np.linspace(0.5 / LATTICE, 1 - 0.5 / LATTICE, LATTICE) * workspace.size - workspace.size / 2
     x, y = np.meshgrid(steps + workspace.center[0], steps + workspace.center[1])
@@ -275,7 +288,7 @@ def table_resolution(camera: Camera, workspace: Workspace) -> float:
     return float(np.linalg.svd(np.stack(moved, axis=-1), compute_uv=False)[:, -1].min())
 
 
-def _shown(image: NDArray) -> NDArray[np.uint8]:
+def _displayable(image: NDArray) -> NDArray[np.uint8]:
     return image if image.ndim == 3 else grey(image)
 
 

@@ -1,4 +1,4 @@
-"""A rerun recording of moments: camera frusta, point clouds, the workspace and the views (extra `viz`)."""
+"""Rerun recording of frames: camera frusta, point clouds, the workspace and the views (extra `viz`)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame
 
-FRUSTUM = 0.1  # metres, where a camera's image is drawn
+FRUSTUM = 0.1  # metres from the camera to its drawn image plane
 POINT_RADIUS = 0.002  # metres
 
 
 class RerunRecording:
-    """Writes moments to a file that `rerun FILE` opens.
+    """Writes frames to a file that `rerun FILE` opens.
 
     Args:
-        file: the file, ending in `.rrd`.
-        workspace: outlined on the table.
+        file: path of the file, ending in `.rrd`.
+        workspace: the workspace, whose outline is drawn on the table and at its height limit.
 
     Raises:
         CommandError: if rerun is not installed.
@@ -33,7 +33,8 @@ class RerunRecording:
             import rerun
         except ImportError:
             raise CommandError(
-                "--rerun=true needs rerun: install the extra with `pip install 'lerobot_policy_symview[viz]'`"
+                "--rerun=true needs rerun, which is not installed: "
+                "run `pip install 'lerobot_policy_symview[viz]'` or pass --rerun=false"
             ) from None
         self._rerun: Any = rerun
         self._stream: Any = rerun.RecordingStream("symview-preview")
@@ -44,10 +45,17 @@ class RerunRecording:
         ]
         self._stream.log("world/workspace", rerun.LineStrips3D(borders), static=True)
 
-    def add(self, moment: int, camera: str, frame: Frame, images: dict[str, NDArray]) -> None:
-        """Add what `camera` sees at one moment, and the images made from it: colour (H, W, 3) or metres (H, W)."""
+    def add(self, index: int, camera: str, frame: Frame, images: dict[str, NDArray]) -> None:
+        """Add one frame.
+
+        Args:
+            index: position of the frame in the recording's timeline.
+            camera: name of the camera.
+            frame: image, depth and pose of the camera.
+            images: views of the frame by name: colour (H, W, 3) uint8, or height (H, W) in metres.
+        """
         rerun, log = self._rerun, self._stream.log
-        self._stream.set_time("frame", sequence=moment)
+        self._stream.set_time("frame", sequence=index)
         pose = frame.camera.world_from_cam
         log(f"world/{camera}", rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         pinhole = rerun.Pinhole(
@@ -65,5 +73,5 @@ class RerunRecording:
             log(f"views/{name}", rerun.Image(image) if image.ndim == 3 else rerun.DepthImage(image, meter=1.0))
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish and close the file."""
         self._stream.disconnect()

@@ -1,4 +1,4 @@
-"""Runs a pipeline of commands, each in a process of its own; what is done is not done again."""
+"""Runs a pipeline of commands, each in its own process. A rerun skips finished stages."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class Stage:
     """One command of a pipeline.
 
     Args:
-        name: short title, also of its log file.
-        command: program and arguments; the program is looked up beside the running Python.
-        result: file or folder that the command makes; removed before it runs.
+        name: short title, also used in the name of its log file.
+        command: program and arguments; the program is taken from the folder of the running Python.
+        result: file or folder that the command writes; it is removed before the command runs.
     """
 
     name: str
@@ -38,13 +38,21 @@ class Stage:
 
 
 def run_stages(stages: Sequence[Stage], folder: Path, environment: dict[str, str]) -> dict[str, float]:
-    """Run `stages` in order and return the seconds each took, when it ran.
+    """Run `stages` in order.
 
-    A stage is skipped when it finished in an earlier run with the same command, its result is there and no stage before
-    it ran again. `folder` keeps the record (`stages.json`) and each command's output (`logs/`).
+    A stage is skipped if an earlier run finished it with the same command, its result exists and no stage before it ran
+    again.
+
+    Args:
+        stages: the stages.
+        folder: folder for the record of finished stages (`stages.json`) and the commands' output (`logs/`).
+        environment: environment variables to set for the commands.
+
+    Returns:
+        Stage name -> seconds that its command took, in this run or the earlier one.
 
     Raises:
-        CommandError: when a command fails; names its log.
+        CommandError: if a command fails; the message names its log.
     """
     folder.mkdir(parents=True, exist_ok=True)
     record_file = folder / "stages.json"
@@ -54,7 +62,7 @@ def run_stages(stages: Sequence[Stage], folder: Path, environment: dict[str, str
         done = record.get(stage.name)
         title = f"[{number}/{len(stages)}] {stage.name}"
         if not stale and done and done["command"] == str(stage) and stage.result.exists():
-            logger.info("%s: done before, in %.0f s", title, done["seconds"])
+            logger.info("%s: finished earlier, in %.0f s", title, done["seconds"])
             continue
         stale = True
         record.pop(stage.name, None)
@@ -73,7 +81,7 @@ def _run(stage: Stage, log: Path, environment: dict[str, str]) -> float:
     start = time.monotonic()
     with (
         log.open("wb") as stream,
-        subprocess.Popen(  # noqa: S603  the command is ours
+        subprocess.Popen(  # noqa: S603  commands of this package only
             [str(program), *stage.command[1:]],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -90,9 +98,7 @@ def _run(stage: Stage, log: Path, environment: dict[str, str]) -> float:
             process.terminate()
             raise
     if process.returncode != 0:
-        raise CommandError(
-            f"the stage {stage.name!r} failed with exit code {process.returncode}; its output is in {log}"
-        )
+        raise CommandError(f"stage {stage.name!r} failed with exit code {process.returncode}; see its output in {log}")
     return time.monotonic() - start
 
 

@@ -1,4 +1,4 @@
-"""Success rates with their uncertainty."""
+"""Success rates and their confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from scipy import stats
 
 @dataclass(frozen=True)
 class SuccessRate:
-    """`successes` of `episodes`, and the 95 % Wilson interval [low, high] of the rate, all in [0, 1]."""
+    """Success rate of a number of episodes, with its 95 % Wilson interval; rate and interval are in [0, 1]."""
 
     successes: int
     episodes: int
 
     def __post_init__(self) -> None:
         if not 0 <= self.successes <= self.episodes or self.episodes == 0:
-            raise ValueError(f"{self.successes} successes of {self.episodes} episodes is not a rate")
+            raise ValueError(f"{self.successes} successes in {self.episodes} episodes is not a rate")
 
     @property
     def rate(self) -> float:
@@ -25,7 +25,7 @@ class SuccessRate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % confidence interval (Wilson), which stays inside [0, 1]."""
+        """95 % Wilson confidence interval (low, high), inside [0, 1]."""
         interval = stats.binomtest(self.successes, self.episodes).proportion_ci(method="wilson")
         return float(interval.low), float(interval.high)
 

@@ -1,4 +1,4 @@
-"""Pages of the documentation as programs: their files, commands and code, in the order of the page, made small."""
+"""Runs a documentation page: its files, commands and Python code, in the order of the page, at a small scale."""
 
 import re
 import shlex
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 README = ROOT / "README.md"
 SHELL_ONLY = {"make", "source", "python", "python3", "python3.12"}
-"""Programs that are neither ours nor LeRobot's, or set up what a test has already."""
+"""Programs that are not run: neither ours nor LeRobot's, or set-up that the test environment already has."""
 TRAINING = {"--steps": 2, "--batch_size": 2, "--policy.device": "cpu"}
 NETWORK = {"--policy.width": 16, "--policy.crop_size": 64}
 EVALUATION = {"--eval.n_episodes": 1, "--eval.batch_size": 1, "--env.max_steps": 2, "--policy.device": "cpu"}
@@ -35,7 +35,7 @@ SMALL = {
     "symview-doctor": {},
     "lerobot-train": TRAINING | {"--num_workers": 0, "--env_eval_freq": 0},
     "--policy.type=symview_bc": NETWORK,
-    "--policy.type=act": {"--policy.pretrained_backbone_weights": "null"},  # which are downloaded from elsewhere
+    "--policy.type=act": {"--policy.pretrained_backbone_weights": "null"},  # the weights would be downloaded
     "--policy.type=diffusion": {
         "--policy.pretrained_backbone_weights": "null",
         "--policy.horizon": 8,
@@ -46,12 +46,12 @@ SMALL = {
     "lerobot-eval": EVALUATION,
     "lerobot-dataset-viz": {"--save": 1, "--output-dir": "."},
 }
-"""What a command, or one with a certain flag, gets beyond the flags of the page; the last counts."""
+"""Command, or flag of a command -> flags that are added after those of the page and override them."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Something between two fences."""
+    """A fenced code block: its language, its text and the line where the text starts."""
 
     language: str
     text: str
@@ -59,14 +59,14 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """Return what a page has between fences, in order."""
+    """Return the fenced code blocks of a page, in order."""
     text = page.read_text()
-    found = re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    return [Block(match[1], match[2], text[: match.start()].count("\n") + 2) for match in found]
+    matches = re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    return [Block(match[1], match[2], text[: match.start()].count("\n") + 2) for match in matches]
 
 
 def needs(page: Path) -> list[str]:
-    """Return the datasets that a page takes for granted, of which a comment that is not shown tells."""
+    """Return the datasets that a page requires, listed in its hidden `needs` comments."""
     return re.findall(r"^<!-- needs: (\S+) -->$", page.read_text(), re.MULTILINE)
 
 
@@ -77,7 +77,7 @@ def commands(text: str) -> list[list[str]]:
 
 
 class Reader:
-    """Somebody who does what a page says, as the user `user` on the Hub, in the present folder."""
+    """Runs pages in the current folder, as the Hub user `user`."""
 
     def __init__(self, user: str, monkeypatch):
         self._user, self._monkeypatch, self._names = user, monkeypatch, {"__name__": "__main__"}
@@ -87,8 +87,8 @@ class Reader:
         return HF_LEROBOT_HOME / self._user / name
 
     def follow(self, page: Path) -> int:
-        """Do it; return how many blocks there were something to do with."""
-        done = 0
+        """Run the blocks of a page; return how many were run."""
+        count = 0
         for block in blocks(page):
             text = re.sub(r"(?<![\w./-])me/", f"{self._user}/", block.text)
             file = re.match(r"# ([\w/.-]+\.(?:yaml|toml|py))\b", text)
@@ -99,17 +99,17 @@ class Reader:
                 for words in commands(text):
                     self.run(words, f"{page.name}:{block.line}")
             elif block.language == "python":
-                exec(compile("\n" * block.line + text, str(page), "exec"), self._names)  # its lines in tracebacks
+                exec(compile("\n" * block.line + text, str(page), "exec"), self._names)  # page lines in tracebacks
             else:
                 continue
-            done += 1
-        return done
+            count += 1
+        return count
 
-    def run(self, words: list[str], place: str) -> None:
-        """Run a command in this process."""
+    def run(self, words: list[str], location: str) -> None:
+        """Run a command in this process; `location` is its page and line, for errors."""
         program = words[0]
         if words[:2] == ["pip", "install"]:
-            if (Path(words[-1]) / "pyproject.toml").is_file():  # the others are here already
+            if (Path(words[-1]) / "pyproject.toml").is_file():  # other packages are installed
                 self._install(Path(words[-1]))
         elif program not in SHELL_ONLY:
             small = SMALL[" ".join(words[:2]) if " ".join(words[:2]) in SMALL else program]
@@ -117,15 +117,15 @@ class Reader:
             flags = [f"{flag}={value}" for flag, value in small.items()]
             self._monkeypatch.setattr(sys, "argv", [*words, *flags])
             (script,) = entry_points(group="console_scripts", name=program)
-            AcceleratorState._reset_state(reset_partial_state=True)  # a process has one precision
+            AcceleratorState._reset_state(reset_partial_state=True)  # accelerate keeps one precision per process
             code = None
             try:
                 script.load()()
             except SystemExit as end:
                 code = end.code
-            assert not code, f"{place}: {' '.join(sys.argv)} ended with {code}"
+            assert not code, f"{location}: {' '.join(sys.argv)} ended with {code}"
 
     def _install(self, project: Path) -> None:
-        """Have a project's package and entry points found, as an editable installation does."""
-        facts = tomllib.loads((project / "pyproject.toml").read_text())["project"]
-        install(project, facts["name"], facts["entry-points"], self._monkeypatch)
+        """Make a project's package and entry points importable, as an editable installation does."""
+        project_table = tomllib.loads((project / "pyproject.toml").read_text())["project"]
+        install(project, project_table["name"], project_table["entry-points"], self._monkeypatch)

@@ -1,4 +1,4 @@
-"""Every page of the documentation, followed to the letter but for numbers."""
+"""Every page of the documentation runs as written, with smaller numbers."""
 
 import shutil
 from pathlib import Path
@@ -11,9 +11,9 @@ from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
-from tests.hostile.files import change_feature
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
+from tests.malicious.files import change_feature
 
 pytestmark = pytest.mark.long
 
@@ -21,7 +21,7 @@ PROSE = ("index.md", "reference.md")  # lists of other pages
 
 
 def real_dataset(folder: Path) -> None:
-    """Record what a robot's own dataset would have: a camera and joints, no calibration and no gripper's pose."""
+    """Record a dataset like a robot's own: a camera and joints, without calibration and gripper pose."""
     pose = (0, 0.70711, -0.70711, 1.02, 1, 0, 0, 0, 0, -0.70711, -0.70711, 0.57, 0, 0, 0, 1)
     camera = CameraSpec("front", 480, 640, intrinsics=(615.3, 0, 319.5, 0, 615.1, 239.5, 0, 0, 1), world_from_cam=pose)
     env = RecordedEnv(camera=camera, oracle=False)
@@ -36,17 +36,17 @@ def real_dataset(folder: Path) -> None:
 
 @pytest.fixture
 def reader(request, tmp_path, monkeypatch, recorded, with_views):
-    """Somebody with the datasets that the page takes for granted, and a Hub."""
+    """A page, and a reader with the datasets that the page requires and a Hub."""
     page = request.param
     monkeypatch.chdir(tmp_path)
     reader = Reader(page.stem, monkeypatch)
-    made = {
+    datasets = {
         "me/picking": lambda folder: shutil.copytree(recorded, folder),
         "me/picking_views": lambda folder: shutil.copytree(with_views, folder),
         "me/real": real_dataset,
     }
     for name in needs(page):
-        made[name](reader.dataset(name.removeprefix("me/")))
+        datasets[name](reader.dataset(name.removeprefix("me/")))
     with HubServer() as hub, online(hub, ALICE):
         hub.users[ALICE] = (page.stem, {page.stem})
         yield page, reader
@@ -57,6 +57,6 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
 @pytest.mark.parametrize(
     "reader", [README, *(page for page in PAGES if page.name not in PROSE)], indirect=True, ids=lambda page: page.stem
 )
-def test_a_page_does_what_it_says(reader):
-    page, somebody = reader
-    assert somebody.follow(page) > 0
+def test_a_page_runs(reader):
+    page, page_reader = reader
+    assert page_reader.follow(page) > 0

@@ -1,4 +1,4 @@
-"""The documentation as a browser shows it."""
+"""The built documentation site, in a browser."""
 
 import shutil
 import subprocess
@@ -26,7 +26,7 @@ QUIET = [
 LARGEST_PAGE = 2 * 10**6  # bytes
 
 
-class Silent(SimpleHTTPRequestHandler):
+class SilentHandler(SimpleHTTPRequestHandler):
     def log_message(self, *arguments):
         pass
 
@@ -42,8 +42,8 @@ def site():
 
 @pytest.fixture(scope="module")
 def address(site):
-    """Where the pages are served."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Silent, directory=site)) as server:
+    """Address of a local server of the pages."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SilentHandler, directory=site)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
@@ -52,7 +52,7 @@ def address(site):
 @pytest.fixture(scope="module")
 def tab():
     """A page of a browser."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)  # else Playwright's own
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)  # None uses Playwright's own
     with sync_playwright() as play:
         window = play.chromium.launch(executable_path=browser, args=QUIET)
         yield window.new_page()
@@ -71,21 +71,19 @@ def test_the_site_has_every_page_and_every_public_name(site):
         assert f'id="lerobot_symview.{name}"' in reference, name
 
 
-def test_a_browser_shows_every_page_without_complaint(site, address, tab):
-    complaints, targets = [], defaultdict(set)
-    tab.on("console", lambda message: message.type in ("error", "warning") and complaints.append(message.text))
-    tab.on("pageerror", lambda error: complaints.append(str(error)))
-    tab.on("requestfailed", lambda request: complaints.append(f"{request.url} failed"))
+def test_every_page_loads_without_errors(site, address, tab):
+    errors, targets = [], defaultdict(set)
+    tab.on("console", lambda message: message.type in ("error", "warning") and errors.append(message.text))
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("requestfailed", lambda request: errors.append(f"{request.url} failed"))
     tab.on(
-        "request", lambda request: request.url.startswith(address) or complaints.append(f"{request.url} is elsewhere")
+        "request", lambda request: request.url.startswith(address) or errors.append(f"{request.url} is not on the site")
     )
-    tab.on(
-        "response", lambda response: response.status < 400 or complaints.append(f"{response.url}: {response.status}")
-    )
+    tab.on("response", lambda response: response.status < 400 or errors.append(f"{response.url}: {response.status}"))
     pages = sorted(file.name for file in site.glob("*.html") if file.name != "404.html")
     for page in pages:
         tab.goto(f"{address}/{page}", wait_until="networkidle")
-        assert complaints == [], page
+        assert errors == [], page
         assert tab.locator("h1").count() == 1, page
         assert (site / page).stat().st_size < LARGEST_PAGE, page
         assert tab.evaluate("[...document.images].filter(image => !image.naturalWidth).map(image => image.src)") == []
@@ -100,7 +98,7 @@ def test_a_browser_shows_every_page_without_complaint(site, address, tab):
         assert [anchor for anchor in anchors - {""} if f'id="{anchor}"' not in text] == [], path
 
 
-def test_what_is_searched_is_found(address, tab):
+def test_the_search_finds_a_function(address, tab):
     tab.goto(f"{address}/index.html", wait_until="networkidle")
     tab.keyboard.press("/")
     tab.keyboard.type("homography")

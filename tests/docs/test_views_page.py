@@ -1,4 +1,4 @@
-"""The tables and numbers of the page on views."""
+"""Tables and numbers in docs/views.md."""
 
 import re
 from dataclasses import fields
@@ -11,14 +11,14 @@ from tests.docs.pages import ROOT
 
 
 @pytest.mark.parametrize("view", [ReprojectedView, PerspectiveView])
-def test_every_option_is_listed_with_its_default(view):
+def test_every_view_option_is_listed_with_its_default(view):
     page = (ROOT / "docs" / "views.md").read_text()
     for option in fields(view):
         default = f"{option.default:g}" if isinstance(option.default, float) else str(option.default).lower()
         assert re.search(rf"^\| `{option.name}` \| `?{re.escape(default)}`? \|", page, re.MULTILINE), option.name
 
 
-def test_the_cut_lies_where_the_page_says():
+def test_the_clipping_height_matches_the_page():
     heights = np.array([0.0, 0.05, 0.07, 0.2])
     assert [ReprojectedView().ceiling(z) for z in heights] == np.maximum(heights - 0.01, 0.06).tolist()
     assert [ReprojectedView(clip_margin=0, clip_floor=0).ceiling(z) for z in heights] == heights.tolist()

@@ -1,4 +1,4 @@
-"""The real client of this process, turned to a Hub on loopback."""
+"""Connects the real Hub client of this process to a Hub server on loopback."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from tests.hub.server import HubServer
 
 @contextmanager
 def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iterator[None]:
-    """Let this process' client, and LeRobot, find `hub` where they look for the Hugging Face Hub, and nothing else.
+    """Redirect all requests of this process' Hub client, and of LeRobot, to `hub`.
 
-    Downloads go to a cache of their own, since the client takes from a cache what the Hub refuses; it is deleted at
-    the end unless `cache` names a folder for it. Retries do not wait. It may be nested, for another user's view.
+    Downloads use a separate cache, since the client falls back to the cache when the Hub refuses a request. It is
+    deleted at the end unless `cache` names its folder. Retries do not wait. The context may be nested, with another
+    user's token.
     """
 
-    class Delivery(httpx.HTTPTransport):
+    class RedirectTransport(httpx.HTTPTransport):
         def handle_request(self, request: httpx.Request) -> httpx.Response:
             url = hub.url + request.url.raw_path.decode()
             return super().handle_request(
@@ -36,7 +37,7 @@ def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iter
 
     def client() -> httpx.Client:
         hooks = {"request": [_http.hf_request_event_hook]}
-        return httpx.Client(transport=Delivery(), event_hooks=hooks, follow_redirects=True, timeout=None)
+        return httpx.Client(transport=RedirectTransport(), event_hooks=hooks, follow_redirects=True, timeout=None)
 
     with ExitStack() as stack:
         folder = cache or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="symview-hub-")))
@@ -44,7 +45,7 @@ def online(hub: HubServer, token: str | None, cache: Path | None = None) -> Iter
         changed = {"HF_HUB_OFFLINE": False, "HF_HUB_DISABLE_XET": True, "HF_HUB_DISABLE_TELEMETRY": True}
         changed |= {"HF_HUB_CACHE": str(folder / "hub"), "HF_TOKEN_PATH": str(folder / "token")}
         stack.enter_context(mock.patch.multiple(constants, **changed))
-        for module in ("dataset_metadata", "lerobot_dataset"):  # which have copies of it
+        for module in ("dataset_metadata", "lerobot_dataset"):  # these modules have copies of the constant
             stack.enter_context(mock.patch(f"lerobot.datasets.{module}.HF_LEROBOT_HUB_CACHE", folder / "lerobot"))
         stack.enter_context(mock.patch.object(_http, "time", SimpleNamespace(sleep=lambda seconds: None)))
         stack.callback(set_client_factory, _http._GLOBAL_CLIENT_FACTORY)  # also closes the connections

@@ -1,19 +1,19 @@
-"""A Hugging Face Hub on loopback, in memory, for the real `huggingface_hub` client and for LeRobot on top of it.
+"""A Hugging Face Hub server on loopback, in memory, for the real `huggingface_hub` client and LeRobot.
 
-    with HubServer() as hub, online(hub, ALICE):  # the client of this process
+    with HubServer() as hub, online(hub, ALICE):  # client in this process
         HfApi().create_repo("alice/demo", repo_type="dataset")
-    with HubServer() as hub:  # that of another process
+    with HubServer() as hub:  # client in another process
         subprocess.run(command, env=os.environ | hub.environment(ALICE))
 
-Both ways work. The client reads HF_ENDPOINT and HF_HUB_OFFLINE once, when it is imported, and modules keep copies.
-`online` therefore changes neither the endpoint nor its copies: the client goes on writing to https://huggingface.co,
-and its HTTP transport delivers that here; the server calls itself what the client calls it. Another process gets the
-variables before it imports anything; there, `RepoCard.validate` (in LeRobot's `push_to_hub`) still asks the real Hub,
-whose address it spells out, and a broken upload is repeated for 23 s before it fails.
+The client reads HF_ENDPOINT and HF_HUB_OFFLINE once, at import, and modules keep copies of them. `online` therefore
+leaves the endpoint unchanged: the client sends requests to https://huggingface.co and its HTTP transport delivers them
+to this server, which uses the host name of the request in its replies. Another process gets the variables before its
+imports. There, `RepoCard.validate` (in LeRobot's `push_to_hub`) still contacts the real Hub at a hard-coded address,
+and a broken upload is retried for 23 s before it fails.
 
-Unlike the Hub, this server sends the files of LFS itself, without a redirect, sends files whole whatever range is asked
-for, lists everything on one page, accepts every card, and gates nothing. Requests that are not here are answered with
-501: Xet, pull requests, spaces, and copies, moves and settings of repositories, among others.
+Unlike the Hub, this server sends LFS files without a redirect, ignores range requests, lists everything on one page,
+accepts every card, and gates no repository. It answers unsupported requests with 501, among them Xet, pull requests,
+spaces, and copying, moving and configuring repositories.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 from tests.hub.storage import LFS_SIZE, LFS_SUFFIXES, Blob, Commit, HubError, Repo, git_hash
 
-ALICE, BOB = "hf_alice", "hf_bob"  # tokens of the users there are by default
+ALICE, BOB = "hf_alice", "hf_bob"  # tokens of the default users
 
 
 class HubServer(ThreadingHTTPServer):
-    """The server; it runs inside `with`, and forgets everything after it.
+    """The server. It runs inside a `with` block and keeps its data in memory.
 
     Attributes:
-        url: Its address, for `HF_ENDPOINT` or `HfApi(endpoint=...)`.
-        users: Of every token, the user's name and the namespaces that it may write to.
-        repos: Repositories by kind (`model` or `dataset`) and id.
-        requests: Method and path of every request, without its query.
-        lfs_uploads: SHA-256 of every object that was received, in that order.
-        fail_uploads_after: Once so many objects were received in all, connections of further uploads break.
+        url: Address of the server, for `HF_ENDPOINT` or `HfApi(endpoint=...)`.
+        users: Token -> user name and the namespaces that the token may write to.
+        repos: Repositories, by kind (`model` or `dataset`) and id.
+        requests: Method and path, without the query, of every request.
+        lfs_uploads: SHA-256 of every received object, in order.
+        fail_uploads_after: Number of received objects after which the connections of further uploads break.
     """
 
     request_queue_size = 64  # the client connects from many threads at once
@@ -58,7 +58,7 @@ class HubServer(ThreadingHTTPServer):
         self.lfs_uploads: list[str] = []
         self.fail_uploads_after: int | None = None
         self.lock = threading.Lock()
-        self.signed: dict[str, tuple[Repo, str]] = {}  # objects to be uploaded, by an address nobody can guess
+        self.signed: dict[str, tuple[Repo, str]] = {}  # random upload key -> repository and SHA-256 of the object
         self.thread = threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True)
 
     def __enter__(self) -> HubServer:
@@ -71,11 +71,11 @@ class HubServer(ThreadingHTTPServer):
         self.thread.join()
 
     def files(self, repo_id: str, kind: str = "dataset", revision: str = "main") -> dict[str, bytes]:
-        """Content of every file of a revision."""
+        """Path -> content of every file of a revision."""
         return {path: blob.content for path, blob in self.repos[kind, repo_id].at(revision).files.items()}
 
     def environment(self, token: str | None) -> dict[str, str]:
-        """Variables that turn another process to this server."""
+        """Environment variables that connect another process to this server."""
         off = {"HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
         return off | {"HF_ENDPOINT": self.url, "HF_TOKEN": token or "", "no_proxy": "127.0.0.1"}
 
@@ -87,7 +87,7 @@ REVISION = r"(?P<revision>[^/]+)"
 
 
 def route(method: str, pattern: str, write: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Let a function answer requests; one whose pattern names a repository gets it if the caller may see it."""
+    """Register a function for requests; where its pattern names a repository, it gets the readable `Repo`."""
 
     def register(function: Callable[..., Any]) -> Callable[..., Any]:
         ROUTES.append((method, re.compile(pattern), write, function))
@@ -99,7 +99,7 @@ def route(method: str, pattern: str, write: bool = False) -> Callable[[Callable[
 class _Handler(BaseHTTPRequestHandler):
     server: HubServer
     protocol_version = "HTTP/1.1"  # connections stay open, as the client expects
-    wbufsize = -1  # headers and body leave together, without the wait for an acknowledgement between them
+    wbufsize = -1  # headers and body are sent together, without waiting for an acknowledgement in between
 
     def answer(self) -> None:
         address = urlsplit(self.path)
@@ -144,10 +144,10 @@ class _Handler(BaseHTTPRequestHandler):
                     kind = named.pop("kind").removesuffix("s/") or "model"
                     named["repo"] = self.repo(kind, named.pop("repo_id"), write)
                 return function(self, **named)
-        raise HubError(501, f"{self.command} {path} is not part of this server")
+        raise HubError(501, f"this server does not support {self.command} {path}")
 
     def repo(self, kind: str, repo_id: str, write: bool) -> Repo:
-        """A repository that the caller may see; a private one is not there for others."""
+        """Return a repository that the user may read; others' private repositories are reported as missing."""
         repo, owner = self.server.repos.get((kind, repo_id)), repo_id.split("/")[0]
         if repo is None or (repo.private and owner not in self.namespaces | {self.user}):
             raise HubError(404 if self.user else 401, "Repository not found", "RepoNotFound")
@@ -188,7 +188,7 @@ class _Handler(BaseHTTPRequestHandler):
         namespace, kind = wanted.get("organization") or self.user, wanted.get("type", "model")
         self.check_write(namespace)
         if kind not in ("model", "dataset"):
-            raise HubError(501, f"A {kind} is not part of this server")
+            raise HubError(501, f"this server does not support a {kind}")
         repo = Repo(kind, f"{namespace}/{wanted['name']}", wanted.get("visibility") == "private")
         if (kind, repo.repo_id) in self.server.repos:
             raise HubError(409, f"You already created this {kind} repo", url=self.address(repo))
@@ -271,7 +271,7 @@ class _Handler(BaseHTTPRequestHandler):
     @route("POST", f"{WEB}.git/info/lfs/objects/batch", write=True)
     def lfs_batch(self, repo: Repo) -> Any:
         wanted = {item["oid"]: item for item in json.loads(self.body)["objects"]}
-        for oid in wanted.keys() - repo.objects.keys():  # the others lack actions: there is nothing to upload
+        for oid in wanted.keys() - repo.objects.keys():  # existing objects get no action: they are not uploaded again
             key = secrets.token_hex()
             self.server.signed[key] = repo, oid
             wanted[oid]["actions"] = {"upload": {"href": f"{self.origin}/lfs/{key}"}}
@@ -284,7 +284,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise ConnectionAbortedError
         repo, oid = hub.signed.get(key, (None, None))
         if repo is None or hashlib.sha256(self.body).hexdigest() != oid:
-            raise HubError(400, "The content does not match what was announced")
+            raise HubError(400, "The content does not match its SHA-256")
         repo.objects[oid] = self.body
         hub.lfs_uploads.append(oid)
         return {}
@@ -294,7 +294,7 @@ class _Handler(BaseHTTPRequestHandler):
         if revision not in repo.branches:
             raise HubError(404, f"Invalid rev id: {revision}", "RevisionNotFound")
         if "create_pr" in self.query:
-            raise HubError(501, "Pull requests are not part of this server")
+            raise HubError(501, "this server does not support pull requests")
         parent = repo.branches[revision]
         files, header = dict(parent.files), {}
         for line in self.body.splitlines():
@@ -309,7 +309,7 @@ class _Handler(BaseHTTPRequestHandler):
             elif key == "lfsFile":
                 raise HubError(400, f"{path} points to an LFS object that was not uploaded")
             elif key != "deletedFile":
-                raise HubError(501, f"{key} is not part of this server")
+                raise HubError(501, f"this server does not support {key}")
             elif files.pop(path, None) is None:
                 raise HubError(404, f"A file with this name doesn't exist: {path}", "EntryNotFound")
         if header.get("parentCommit", parent.oid) != parent.oid:

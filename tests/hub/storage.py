@@ -1,4 +1,4 @@
-"""What the Hub on loopback keeps: repositories, their commits and files."""
+"""Storage of the Hub server on loopback: repositories, commits and files."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from functools import cached_property
 from typing import Any
 
 LFS_SUFFIXES = (".parquet", ".safetensors", ".png", ".mp4")
-LFS_SIZE = 1_000_000  # a larger file goes to LFS whatever its name
+LFS_SIZE = 1_000_000  # bytes; a larger file is stored in LFS whatever its name
 GITATTRIBUTES = "".join(f"*{suffix} filter=lfs diff=lfs merge=lfs -text\n" for suffix in LFS_SUFFIXES)
 
 
 class HubError(Exception):
-    """An answer other than 200; `code` is what the client tells its exceptions by."""
+    """A reply with a status other than 200; the client chooses its exception by `code`."""
 
     def __init__(
         self, status: int, message: str, code: str = "", headers: dict[str, str] | None = None, **body: Any
@@ -27,7 +27,7 @@ class HubError(Exception):
 
 @dataclass(frozen=True)
 class Blob:
-    """A file's content; git itself holds only a pointer to one that is in LFS."""
+    """A file's content; for a file in LFS, git holds only a pointer."""
 
     content: bytes
     is_lfs: bool = False
@@ -47,13 +47,13 @@ class Blob:
 
     @property
     def etag(self) -> str:
-        """What the client compares with its own file."""
+        """Hash that the client compares with that of its own file."""
         return self.sha256 if self.is_lfs else self.oid
 
 
 @dataclass(frozen=True)
 class Commit:
-    """A state of all files; the same history has the same `oid` on every server."""
+    """A snapshot of all files; equal histories have equal `oid`s on every server."""
 
     files: dict[str, Blob]
     title: str
@@ -75,7 +75,7 @@ class Repo:
     branches: dict[str, Commit] = field(default_factory=dict)
     tags: dict[str, Commit] = field(default_factory=dict)
     commits: dict[str, Commit] = field(default_factory=dict)
-    objects: dict[str, bytes] = field(default_factory=dict)  # of LFS, by SHA-256, committed or not
+    objects: dict[str, bytes] = field(default_factory=dict)  # LFS objects by SHA-256, committed or not
 
     def __post_init__(self) -> None:
         self.add("main", Commit({".gitattributes": Blob(GITATTRIBUTES.encode())}, "initial commit"))

@@ -1,4 +1,4 @@
-"""Datasets and policies go to the Hub and come back, over HTTP; and what users are told when that fails."""
+"""Pushing datasets and policies to the Hub and loading them again, over HTTP; and the errors when that fails."""
 
 import json
 import os
@@ -27,7 +27,7 @@ from tests.helpers.training import train
 from tests.hub.client import online
 from tests.hub.server import ALICE, BOB, HubServer
 
-STOCK = {  # as small as they go
+STOCK = {  # the smallest networks
     "act": ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32"]
     + ["--policy.pretrained_backbone_weights=null"],
     "diffusion": ["--policy.horizon=8", "--policy.n_action_steps=4", "--policy.drop_n_last_frames=3"]
@@ -44,7 +44,7 @@ def hub():
 
 @pytest.fixture
 def target(recorded, tmp_path):
-    """A dataset on disk that alice may push."""
+    """A local dataset that the user alice may push."""
     folder = shutil.copytree(recorded, tmp_path / "recorded")
     return HubDataset("alice/picking", folder)
 
@@ -53,14 +53,14 @@ def local_files(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_generated_dataset_is_pulled_by_its_name(hub, tmp_path):
+def test_a_generated_dataset_is_pushed_and_loaded(hub, tmp_path):
     dataset = NewDataset("alice/new", tmp_path / "new", push_to_hub=True, tags=["mine"])
     folder = generate(GenerateConfig(dataset, num_episodes=1))
     assert {name: hub.files("alice/new")[name] for name in local_files(folder)} == local_files(folder)
-    pulled, here = LeRobotDataset("alice/new"), LeRobotDataset("alice/new", root=folder)
+    pulled, local = LeRobotDataset("alice/new"), LeRobotDataset("alice/new", root=folder)
     assert pulled.root != folder
-    assert torch.equal(pulled[3]["action"], here[3]["action"])
-    assert torch.equal(pulled[3]["observation.images.side"], here[3]["observation.images.side"])
+    assert torch.equal(pulled[3]["action"], local[3]["action"])
+    assert torch.equal(pulled[3]["observation.images.side"], local[3]["observation.images.side"])
     card = DatasetCard(hub.files("alice/new")["README.md"].decode())
     assert {"LeRobot", "symview", "mine"} <= set(card.data.tags)
     for fact in ("block_picking", "panda", "`observation.images.side`", "45 degrees", "100.0 %", "K in pixels"):
@@ -70,18 +70,18 @@ def test_a_generated_dataset_is_pulled_by_its_name(hub, tmp_path):
 
 def test_views_are_pushed_to_a_private_branch_with_their_parameters(hub, target, tmp_path):
     pushed = replace(target, push_to_hub=True, private=True, branch="small")
-    add_views(AddViewsConfig(pushed, new_repo_id="alice/seen", new_root=tmp_path / "seen", size=76, keep=[]))
-    assert hub.repos["dataset", "alice/seen"].private
+    add_views(AddViewsConfig(pushed, new_repo_id="alice/views", new_root=tmp_path / "views", size=76, keep=[]))
+    assert hub.repos["dataset", "alice/views"].private
     assert ("dataset", "alice/picking") not in hub.repos
-    text = hub.files("alice/seen", revision="small")["README.md"].decode()
+    text = hub.files("alice/views", revision="small")["README.md"].decode()
     assert "view `reproj` made from camera `side` (size=76, infill=nearest" in text
     assert "--policy.method=reproj_equi" in text
-    assert LeRobotDataset("alice/seen", revision="small").meta.total_episodes == 2
+    assert LeRobotDataset("alice/views", revision="small").meta.total_episodes == 2
     with online(hub, BOB), pytest.raises(Exception, match=r"404|not found|Not Found"):
-        LeRobotDataset("alice/seen", revision="small")
+        LeRobotDataset("alice/views", revision="small")
 
 
-def test_an_upload_that_breaks_off_is_gone_on_with(hub, target):
+def test_a_broken_upload_is_resumed(hub, target):
     before = local_files(target.folder())
     hub.fail_uploads_after = 1
     with pytest.raises(CommandError, match=r"broke off.*Nothing is lost.*--resume=true"):
@@ -101,31 +101,31 @@ def test_an_upload_that_breaks_off_is_gone_on_with(hub, target):
         (None, "`hf auth login`"),
     ],
 )
-def test_who_may_not_push_is_told_what_to_do(token, message, hub, target):
-    with online(hub, token), pytest.raises(CommandError, match=message) as told:
+def test_a_refused_push_names_the_remedy(token, message, hub, target):
+    with online(hub, token), pytest.raises(CommandError, match=message) as error:
         push_dataset(target, target)
-    assert "Nothing is lost" in str(told.value)
+    assert "Nothing is lost" in str(error.value)
 
 
-def test_without_a_network_it_says_so(target, monkeypatch):
+def test_a_push_without_a_network_is_an_error(target, monkeypatch):
     with pytest.raises(CommandError, match="HF_HUB_OFFLINE=1 keeps alice/picking from the Hub: unset it"):
         push_dataset(target, target)
-    with HubServer() as gone, online(gone, ALICE):
-        gone.__exit__(None, None, None)
+    with HubServer() as stopped, online(stopped, ALICE):
+        stopped.__exit__(None, None, None)
         with pytest.raises(CommandError, match="the Hub cannot be reached"):
             push_dataset(target, target)
 
 
-def test_a_policy_is_pushed_by_lerobot_and_evaluated_by_its_name(hub, with_views, tmp_path, monkeypatch):
+def test_lerobot_pushes_a_policy_and_evaluates_it_by_name(hub, with_views, tmp_path, monkeypatch):
     options = ("--policy.push_to_hub=true", "--policy.repo_id=alice/picker", "--policy.tags=[mine]")
-    local = train(monkeypatch, with_views, tmp_path / "policy", *options)
+    checkpoint = train(monkeypatch, with_views, tmp_path / "policy", *options)
     card = ModelCard(hub.files("alice/picker", kind="model")["README.md"].decode())
     assert card.data.datasets == ["test/recorded"]
     assert {"symview", "symview_bc", "mine"} <= set(card.data.tags)
     for fact in ("method `reproj_equi`", "group D4", "x, y, z, yaw, aperture", "steps 2", "episodes 2", "## Limits"):
         assert fact in card.text
-    pulled, here = SymviewBcPolicy.from_pretrained("alice/picker"), SymviewBcPolicy.from_pretrained(local)
-    assert all(one.equal(other) for one, other in zip(pulled.parameters(), here.parameters(), strict=True))
+    pulled, local = SymviewBcPolicy.from_pretrained("alice/picker"), SymviewBcPolicy.from_pretrained(checkpoint)
+    assert all(mine.equal(other) for mine, other in zip(local.parameters(), pulled.parameters(), strict=True))
     steps = make_pre_post_processors(pulled.config, "alice/picker")[0].steps
     assert [type(step).__name__ for step in steps].count("ViewsProcessorStep") == 1
     arguments = ["lerobot-eval", "--policy.path=alice/picker", "--policy.device=cpu", "--env.type=symview"]
@@ -140,8 +140,8 @@ def test_a_policy_is_pushed_by_lerobot_and_evaluated_by_its_name(hub, with_views
     assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
 
 
-def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
-    """In a process of its own, as a user has it: the dataset by its name, the plugin found because it is installed."""
+def test_lerobot_train_pulls_a_dataset_by_name(target, tmp_path):
+    """In its own process, as a user runs it: LeRobot pulls the dataset and discovers the installed plugin."""
     with HubServer() as hub:
         with online(hub, ALICE):
             push_dataset(target, target)
@@ -156,8 +156,8 @@ def test_lerobot_train_needs_nothing_of_ours_to_pull(target, tmp_path):
 
 
 @pytest.mark.parametrize(("policy", "options"), STOCK.items())
-def test_a_stock_policy_brings_its_view_along_to_another_process(policy, options, recorded, tmp_path, monkeypatch):
-    """Trained on a view, with our step in its preprocessing: who has the plugin evaluates it from the Hub."""
+def test_a_stock_policy_loads_its_view_in_another_process(policy, options, recorded, tmp_path, monkeypatch):
+    """A stock policy trained on a view, with our step in its preprocessor, is evaluated from the Hub."""
     config = AddViewsConfig(
         HubDataset("test/recorded", recorded),
         new_root=tmp_path / "stock",

@@ -1,4 +1,4 @@
-"""The server that stands in for the Hugging Face Hub, driven by the real client."""
+"""The Hub server of the tests, used through the real client."""
 
 import hashlib
 import os
@@ -66,10 +66,10 @@ def create(**options):
     return HfApi().create_repo(DEMO, repo_type="dataset", **options)
 
 
-def test_a_folder_comes_back_as_it_went(hub, folder, tmp_path):
+def test_a_folder_round_trip(hub, folder, tmp_path):
     api, address = HfApi(), create()
     assert (address, address.repo_id) == (f"https://huggingface.co/datasets/{DEMO}", DEMO)
-    commit = upload(folder, commit_message="All of it")
+    commit = upload(folder, commit_message="All files")
     assert commit.repo_url == address
     info = api.repo_info(DEMO, repo_type="dataset")
     assert (info.sha, info.private) == (commit.oid, False)
@@ -87,7 +87,7 @@ def test_a_folder_comes_back_as_it_went(hub, folder, tmp_path):
     assert (len(hub.lfs_uploads), set(hub.lfs_uploads)) == (len(IN_LFS), IN_LFS)
 
 
-def test_what_is_there_is_not_sent_again(hub, folder):
+def test_uploaded_files_are_not_sent_again(hub, folder):
     create()
     first = upload(folder)
     assert upload(folder).oid == first.oid
@@ -154,11 +154,11 @@ def test_private_repositories_are_hidden_from_others(hub, folder):
             snapshot_download(DEMO, repo_type="dataset", token=token)
         assert not other.file_exists(DEMO, "README.md", repo_type="dataset")
     assert hf_hub_download(DEMO, "model.safetensors", repo_type="dataset")
-    with pytest.raises(RepositoryNotFoundError):  # a dataset is no model
+    with pytest.raises(RepositoryNotFoundError):  # a dataset is not a model
         HfApi().repo_info(DEMO)
 
 
-def test_tokens(hub, folder):
+def test_token_permissions(hub, folder):
     assert HfApi().whoami()["name"] == "alice"
     hub.users["hf_read"] = ("alice", set())
     hub.users["hf_team"] = ("carol", {"carol", "alice"})
@@ -186,7 +186,7 @@ def test_tokens(hub, folder):
         HfApi(token=False).create_repo("alice/new")
 
 
-def test_a_broken_upload_goes_on_where_it_stopped(hub, folder):
+def test_a_broken_upload_resumes(hub, folder):
     create()
     hub.fail_uploads_after = 2
     with pytest.raises(RuntimeError, match="Error while uploading"):
@@ -199,7 +199,7 @@ def test_a_broken_upload_goes_on_where_it_stopped(hub, folder):
     assert hub.files(DEMO)["videos/large.bin"] == FILES["videos/large.bin"]
 
 
-def test_the_client_stays_inside_and_is_offline_again_afterwards(tmp_path):
+def test_requests_stay_local_and_the_client_is_offline_afterwards(tmp_path):
     with HubServer() as hub:
         with online(hub, ALICE, tmp_path):
             with online(hub, None), pytest.raises(HfHubHTTPError, match="401"):
@@ -214,7 +214,7 @@ def test_the_client_stays_inside_and_is_offline_again_afterwards(tmp_path):
     assert list(tmp_path.rglob(".gitattributes"))
 
 
-def test_another_process_finds_it_by_its_environment(hub, folder, tmp_path):
+def test_another_process_connects_through_its_environment(hub, folder, tmp_path):
     code = f"""
 from huggingface_hub import create_repo, snapshot_download, upload_folder
 print(create_repo({DEMO!r}, private=True))

@@ -24,14 +24,14 @@ def runs(path):
     return len(path.with_suffix(".runs").read_text())
 
 
-def test_finished_stages_are_not_run_again(tmp_path):
+def test_finished_stages_are_skipped(tmp_path):
     stages = [counting(tmp_path / "a", "first"), counting(tmp_path / "b", "second")]
     seconds = run_stages(stages, tmp_path, {})
     assert seconds == run_stages(stages, tmp_path, {})
     assert runs(tmp_path / "a") == runs(tmp_path / "b") == 1
 
 
-def test_after_a_failure_the_pipeline_continues_at_the_failed_stage(tmp_path):
+def test_a_rerun_continues_at_the_failed_stage(tmp_path):
     first = counting(tmp_path / "a", "first")
     failing = counting(tmp_path / "b", "second", extra="sys.exit(3)")
     with pytest.raises(CommandError, match=r"'second' failed with exit code 3.*2-second\.log"):
@@ -41,7 +41,7 @@ def test_after_a_failure_the_pipeline_continues_at_the_failed_stage(tmp_path):
     assert runs(tmp_path / "b") == 2
 
 
-def test_a_changed_command_or_missing_result_repeats_it_and_what_follows(tmp_path):
+def test_a_changed_command_or_missing_result_repeats_the_later_stages(tmp_path):
     stages = [counting(tmp_path / "a", "first"), counting(tmp_path / "b", "second")]
     run_stages(stages, tmp_path, {})
     (tmp_path / "a").unlink()
@@ -51,7 +51,7 @@ def test_a_changed_command_or_missing_result_repeats_it_and_what_follows(tmp_pat
     assert runs(tmp_path / "b") == 3
 
 
-def test_output_goes_to_the_log_and_the_environment_to_the_command(tmp_path, capfd):
+def test_output_is_logged_and_the_environment_is_passed(tmp_path, capfd):
     code = "import os, sys, pathlib; print(os.environ['GREETING']); pathlib.Path(sys.argv[1]).touch()"
     stage = Stage("greet", (PYTHON, "-c", code, str(tmp_path / "g")), tmp_path / "g")
     run_stages([stage], tmp_path, {"GREETING": "hello"})

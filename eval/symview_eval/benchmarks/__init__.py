@@ -1,1 +1,1 @@
-"""The suites of `symview-benchmark`."""
+"""The command `symview-benchmark` and its suites."""

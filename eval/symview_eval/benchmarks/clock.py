@@ -1,4 +1,4 @@
-"""Measuring what a function takes of a larger whole."""
+"""Timing of a call, and of one function inside a larger computation."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 
 
 def seconds(call: Callable[[], object]) -> float:
-    """Return how long a call takes."""
+    """Call `call` and return the wall-clock time it takes, seconds."""
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
 
 
 class Clock:
-    """Replaces a function by itself with a clock.
+    """Wraps a function in place and accumulates the wall-clock time of its calls in `milliseconds`.
 
     Args:
-        owner: the module, class or object it belongs to.
-        name: its name there.
+        owner: the module, class or object that has the function as an attribute.
+        name: name of the attribute.
     """
 
     def __init__(self, owner: Any, name: str):
@@ -37,5 +37,5 @@ class Clock:
         setattr(owner, name, timed)
 
     def remove(self) -> None:
-        """Put the function back as it was."""
+        """Restore the original function."""
         setattr(self._owner, self._name, self._function)

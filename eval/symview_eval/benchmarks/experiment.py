@@ -1,4 +1,4 @@
-"""Where the time of an experiment's cells goes."""
+"""Suite `experiment`: time of an experiment's cells and its parts."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExperimentBenchmark:
-    """Cells of table 1, as many as run at once, twice over: how long they take and what for."""
+    """Measure the time of cells of table 1 and its parts, over twice as many cells as run at once."""
 
     scale: str = "laptop"
-    """How large: paper, laptop or smoke."""
+    """Size of the runs: paper, laptop or smoke."""
     task: str = "block_picking"
-    """Of the paper's table 1."""
+    """Task, one of the paper's table 1."""
     method: str = "reproj_equi"
-    """Row of that table."""
+    """Method, one row of that table."""
     device: str = "cpu"
-    """Of the networks."""
+    """PyTorch device of the networks, such as cpu or cuda."""
     num_workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Cells that run at once."""
+    """Cells that run in parallel."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -41,15 +41,16 @@ class ExperimentBenchmark:
 
 
 def benchmark_experiment(config: ExperimentBenchmark) -> dict[str, float]:
-    """Return what a cell takes, and for what.
+    """Run the cells and time them.
 
-    `cell_s` is the median time of a cell, beside the others; `cells_per_hour` counts all of the command's time.
-    `useful_core_share` is the processor time of trainings, evaluations and simulators to the command's time on all
-    cores, start-up and recording of demonstrations included, below 1 where cores wait. Of a cell's time,
-    `preparation_share`, `training_share` and `waiting_share` follow each other; evaluations take `evaluation_share`,
-    most of it beside the training.
+    Returns:
+        `cell_s`: median time of a cell while the others run, seconds. `cells_per_hour`: cells over the command's whole
+        time. `useful_core_share`: CPU time of trainings, evaluations and simulators over the command's time times the
+        number of cores; the command's time includes start-up and the recording of demonstrations, and idle cores lower
+        the share. `preparation_share`, `training_share` and `waiting_share`: consecutive parts of a cell's time.
+        `evaluation_share`: evaluations, most of them in parallel with the training.
     """
-    from symview_eval.experiments.experiment import ExperimentConfig, run_experiment
+    from symview_eval.experiments.cli import ExperimentConfig, run_experiment
     from symview_eval.experiments.results import read_result
 
     with tempfile.TemporaryDirectory() as folder:

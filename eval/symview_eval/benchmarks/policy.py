@@ -1,4 +1,4 @@
-"""What training and running the equivariant policy costs, beside escnn and an ordinary network of the same widths."""
+"""Suite `policy`: training and inference time of the equivariant policy, relative to escnn and to a plain network."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from symview_sim.settings import NewDataset
 LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
 PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"
 LOADED_EPISODES = 4
-MARGIN = 24  # pixels that the random crop may choose among: the paper's 152 for 128
+MARGIN = 24  # pixels between the image and its random crop: the paper crops 152 to 128
 
 
 @dataclass(frozen=True)
 class PolicyBenchmark:
-    """Training steps, inference, start and data loading of symview_bc, as ratios of one run."""
+    """Measure training steps, inference, start-up and data loading of symview_bc, as ratios within one run."""
 
     batch_size: int = 128
     """Samples per training step."""
     width: int = 64
-    """Regular fields n of the network."""
+    """Width n of the network: regular fields per layer."""
     crop_size: int = 128
-    """Pixels the network sees."""
+    """Rows and columns of the crop that the network takes, pixels."""
     repeats: int = 3
-    """Training steps of each network; medians are taken. Inference is repeated ten times as often."""
+    """Timed training steps of each network; medians are reported. Inference is timed ten times as often."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Precision of our convolutions. escnn's are in float32, the ordinary network's in whichever is faster."""
+    """Precision of our convolutions. escnn runs in float32, the plain network in the faster of the two."""
     device: str = "cpu"
-    """What the networks run on, such as `cuda`; data is loaded by the processor."""
+    """PyTorch device of the networks, such as `cuda`; data is loaded on the CPU."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -65,14 +65,14 @@ class PolicyBenchmark:
         try:
             torch.empty(0, device=self.device)
         except (AssertionError, RuntimeError) as error:
-            raise ValueError(f"--device={self.device} cannot be used here: {error}") from None
+            raise ValueError(f"--device={self.device} is not available here: {error}") from None
 
 
 class PlainNetwork(nn.Module):
-    """Ordinary convolutions of an encoder's expanded widths, with its filters as they are at the time.
+    """Plain convolutions with the expanded widths and the current filters of an equivariant encoder.
 
-    Training it is what dense execution of the equivariant network would cost if expanding filters were free; running it
-    is the network with its filters expanded once.
+    A training step costs as much as dense execution of the equivariant network if the expansion of filters were free.
+    Inference is that of the equivariant network with its filters expanded once.
     """
 
     def __init__(self, encoder: ImageEncoder):
@@ -87,11 +87,11 @@ class PlainNetwork(nn.Module):
             dense.load_state_dict({"weight": weight.reshape(outputs, inputs, 3, 3), "bias": bias})
             self.layers.append(dense)
 
-    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Map pictures (B, C, crop, crop) and states (B, D) to features (B, channels)."""
-        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
-        features = torch.cat([picture, planes], dim=1)
-        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as ours
+    def forward(self, image: Tensor, state: Tensor) -> Tensor:
+        """Map images (B, C, crop, crop) and states (B, D) to features (B, channels)."""
+        planes = state[:, :, None, None].expand(-1, -1, *image.shape[-2:])
+        features = torch.cat([image, planes], dim=1)
+        if torch.is_autocast_enabled(features.device.type) or features.is_cuda:  # as in our encoder
             features = features.contiguous(memory_format=torch.channels_last)
         for layer, pool in zip(self.layers, self.pooled, strict=True):
             features = layer(features)
@@ -100,13 +100,15 @@ class PlainNetwork(nn.Module):
 
 
 def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
-    """Return what everything costs, in seconds unless the name says otherwise.
+    """Time the policy and the networks it is compared with.
 
-    `train_step_ratio_escnn_fp32` and `train_step_ratio_plain` compare a training step with escnn's and with that of an
-    ordinary network of the same expanded widths in its faster precision, `inference_ratio_b1` and `_b5` inference with
-    the latter's. `train_step_floor_s` is what its arithmetic takes at the rate of large matrix products, in `--dtype`.
-    `plugin_import_s` is what the plugin adds to LeRobot's import, `loader_share` what loading a batch takes over what a
-    training step does.
+    Returns:
+        Times in seconds unless the name says otherwise. `train_step_ratio_escnn_fp32` and `train_step_ratio_plain`: our
+        training step over escnn's, and over that of a plain network of the same expanded widths in its faster
+        precision. `inference_ratio_b1` and `_b5`: our inference over the plain network's, for batches of 1 and 5.
+        `train_step_floor_s`: the plain network's arithmetic at the rate of large matrix products in `--dtype`.
+        `plugin_import_s`: time that the plugin adds to LeRobot's import. `loader_share`: time to load a batch over the
+        time of a training step.
     """
     from lerobot_policy_symview.nn.escnn_bridge import EscnnEncoder
 
@@ -121,8 +123,8 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
         nn.init.normal_(parameter, std=0.02)
     networks: dict[str, tuple[nn.Module, str]] = {"": (encoder, config.dtype), "escnn_": (escnn, "float32")}
     networks |= {f"plain_{dtype}_": (plain, dtype) for dtype in _precisions(config.device)}
-    picture, state = _input(config, policy, config.batch_size)
-    calls = {name: _training_step(network, picture, state, dtype) for name, (network, dtype) in networks.items()}
+    image, state = _input(config, policy, config.batch_size)
+    calls = {name: _training_step(network, image, state, dtype) for name, (network, dtype) in networks.items()}
     steps = _medians(calls, config.repeats, "step")
     results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
     results |= {
@@ -134,8 +136,8 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     if "plain_bfloat16_" in networks:  # converted once, not at every call
         networks["plain_bfloat16_"] = (deepcopy(plain).to(torch.bfloat16), "bfloat16")
     for batch in (1, 5):
-        seen = _input(config, policy, batch)
-        calls = {name: _inference(network.eval(), *seen, dtype) for name, (network, dtype) in networks.items()}
+        inputs = _input(config, policy, batch)
+        calls = {name: _inference(network.eval(), *inputs, dtype) for name, (network, dtype) in networks.items()}
         times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
         results |= {
             f"inference_ms_b{batch}": 1000 * times[""],
@@ -159,29 +161,29 @@ def _policy(config: PolicyBenchmark) -> SymviewBcPolicy:
 def _input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
     size = config.crop_size
-    picture = torch.rand(batch, policy.config.channels, size, size, generator=generator)
-    return picture.to(config.device), torch.rand(batch, 2, generator=generator).to(config.device)
+    image = torch.rand(batch, policy.config.channels, size, size, generator=generator)
+    return image.to(config.device), torch.rand(batch, 2, generator=generator).to(config.device)
 
 
 def _precisions(device: str) -> list[str]:
-    """Return what an ordinary network is run in; without vector instructions for it, bfloat16 takes minutes."""
+    """Return the precisions of the plain network: bfloat16 takes minutes on a CPU without instructions for it."""
     is_emulated = device == "cpu" and not torch.backends.cpu.get_cpu_capability().startswith("AVX512")
     return ["float32"] if is_emulated else ["float32", "bfloat16"]
 
 
 def _plain(times: Mapping[str, float]) -> float:
-    """Return the ordinary network's time in its faster precision."""
+    """Return the plain network's time in its faster precision."""
     return min(seconds for name, seconds in times.items() if name.startswith("plain_"))
 
 
-def _training_step(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
-    """Return a training step: least squares on the features, which any head costs next to nothing beside."""
+def _training_step(network: nn.Module, image: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
+    """Return a training step, least squares on the features: a head's time is negligible."""
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-5)
 
     def step() -> None:
         network.train()
-        with torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16"):
-            features = network(picture, state)
+        with torch.autocast(image.device.type, torch.bfloat16, enabled=dtype == "bfloat16"):
+            features = network(image, state)
         features.float().square().mean().backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -189,37 +191,37 @@ def _training_step(network: nn.Module, picture: Tensor, state: Tensor, dtype: st
     return step
 
 
-def _inference(network: nn.Module, picture: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
+def _inference(network: nn.Module, image: Tensor, state: Tensor, dtype: str) -> Callable[[], None]:
     def run() -> None:
-        reduced = torch.autocast(picture.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
-        with torch.inference_mode(), reduced:
-            network(picture, state)
+        precision = torch.autocast(image.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
+        with torch.inference_mode(), precision:
+            network(image, state)
 
     return run
 
 
 def _medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str) -> dict[str, float]:
-    """Time all calls in turn, once unmeasured and then `repeats` times: median seconds."""
+    """Run all calls in turn, once as a warm-up and then `repeats` times; return the median seconds of each."""
     times: dict[str, list[float]] = {key: [] for key in calls}
     for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
         for key, call in calls.items():
-            _finish()
+            _synchronize()
             start = time.perf_counter()
             call()
-            _finish()
+            _synchronize()
             if repeat:
                 times[key].append(time.perf_counter() - start)
     return {key: statistics.median(values) for key, values in times.items()}
 
 
-def _finish() -> None:
-    """Wait for a GPU, if there is one: calls return before it is done."""
+def _synchronize() -> None:
+    """Wait for the GPU, if there is one: calls return before it has finished."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
 
 
 def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
-    """Floating-point operations of a dense training step: three convolutions per layer, two for the first."""
+    """Return the floating-point operations of a dense training step: 3 convolutions per layer, 2 for the first."""
     side, total = config.crop_size, 0.0
     for index, (layer, pool) in enumerate(zip(network.layers, network.pooled, strict=True)):
         assert isinstance(layer, nn.Conv2d)
@@ -230,19 +232,19 @@ def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
 
 
 def _operations_per_second(config: PolicyBenchmark, size: int = 1024, repeats: int = 5) -> float:
-    """Measure matrix products, the fastest arithmetic there is."""
+    """Return the measured rate of matrix products, the fastest arithmetic of the device."""
     a, b = torch.rand(2, size, size, device=config.device, dtype=getattr(torch, config.dtype))
     return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
 
 
 def _plugin_import() -> float:
     command = [sys.executable, "-c", PLUGIN]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  our own words
+    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  a constant of this module
     return float(done.stdout.split()[-1])
 
 
 def _loading_seconds(config: PolicyBenchmark) -> float:
-    """Return the time a batch takes LeRobot's loader in the training process, of a dataset that holds only views."""
+    """Return the seconds that LeRobot's loader takes per batch in the training process, for a dataset of views only."""
     from lerobot.datasets import LeRobotDataset
 
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""What a joint step of reinforcement learning costs beside its parts."""
+"""Suite `rl`: time of a joint step of reinforcement learning, of its parts and of a replay sample."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ BETA = 0.4
 
 @dataclass(frozen=True)
 class RlBenchmark:
-    """Cost of a joint step, in which simulators and updates overlap, and of a sample. The defaults are the paper's."""
+    """Measure a joint step, in which simulators and updates overlap, and a replay sample, at the paper's sizes."""
 
     env: EnvSettings = field(default_factory=EnvSettings)
-    """What is simulated."""
+    """The environment."""
     policy: SymviewSacfdConfig = field(default_factory=SymviewSacfdConfig)
-    """What is trained."""
+    """The policy."""
     batch_size: int = 128
     """Transitions per update."""
     num_simulators: int = 5
     """Simulators in parallel."""
     rounds: int = 5
-    """Joint steps to time, each beside its parts."""
+    """Joint steps to time, each followed by its parts."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -52,13 +52,14 @@ class RlBenchmark:
 
 
 def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
-    """Return what everything costs; medians of rounds that time a joint step, the network and the simulators in turn.
+    """Time joint steps, the network alone and the simulators alone in turn, and replay samples.
 
-    `joint_step_s` is a joint step, `network_s` its acting and updating alone, `simulation_s` a step of all simulators
-    alone. `joint_step_ratio` is the first to the larger of the others, below which no overlap leads. Of a joint step's
-    time, `network_share` is spent in acting and updating, `waiting_share` in waiting for simulators after that, and for
-    `simulation_share` the slowest simulator was at work. `sample_ms` is drawing a batch in its stored form,
-    `sample_floor_ms` copying as many bytes that lie in a row.
+    Returns:
+        Medians over rounds. `joint_step_s`: a joint step. `network_s`: its acting and updating alone. `simulation_s`: a
+        step of all simulators alone. `joint_step_ratio`: the first over the larger of the other two; 1 is perfect
+        overlap. Shares of a joint step's time: `network_share`, acting and updating; `waiting_share`, waiting for the
+        simulators after that; `simulation_share`, the slowest simulator's work. `sample_ms`: drawing a batch in its
+        stored form. `sample_floor_ms`: copying as many contiguous bytes. `bytes_per_transition`: size in the replay.
     """
     from lerobot_policy_symview.rl.demonstrations import open_dataset
     from lerobot_policy_symview.rl.train_config import TrainRlConfig
@@ -115,7 +116,7 @@ def _joint_steps(config: RlBenchmark, training: Training, alone: Simulators) -> 
     }
     times: dict[str, list[float]] = {name: [] for name in parts}
     for part in parts.values():
-        part()  # the first round is not counted
+        part()  # warm-up, not counted
     training.seconds = dict.fromkeys(training.seconds, 0.0)
     for _ in tqdm(range(config.rounds), desc="joint steps", unit="round"):
         for name, part in parts.items():

@@ -1,4 +1,4 @@
-"""What views cost: as ratios to OpenCV's warp of the same image in the same run, and offline, end to end."""
+"""Suite `views`: time of a view relative to OpenCV's warp of the same image, and of `symview-add-views` end to end."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
 
 BATCH = 64  # frames on a GPU
-NOISE = 2.0  # levels of 255, standard deviation: a webcam indoors
-RECORDED = 25  # episodes that the offline dataset repeats
+NOISE = 2.0  # standard deviation in levels of 255: a webcam indoors
+RECORDED = 25  # recorded episodes, repeated to fill the offline dataset
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
     "reproject_none": ("reproj", {"infill": "none"}),
@@ -52,14 +52,14 @@ CODECS = (
 
 @dataclass(frozen=True)
 class ViewsBenchmark:
-    """Cost of views at 152 x 152 on one core, and of `symview-add-views`."""
+    """Measure views of 152 x 152 pixels on one core, and `symview-add-views`."""
 
     repeats: int = 300
-    """How often each view is made; each time is followed by one of OpenCV's warp, whose ratio counts."""
+    """Renderings of each view; each is timed together with one OpenCV warp, and the ratio is reported."""
     frames: int = 10_000
-    """Frames of the dataset to which views are added; 0 leaves that out. A second process takes seconds to start."""
+    """Frames of the dataset to which views are added; 0 skips this part. A second process takes seconds to start."""
     rounds: int = 3
-    """How often views are added to all of it, by one process and by two."""
+    """Times that views are added to the whole dataset, by one process and by two."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -72,13 +72,15 @@ class ViewsBenchmark:
 
 
 def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
-    """Return medians, with quartiles as `_low` and `_high`, of every view's time over that of `cv2.warpPerspective`.
+    """Time the views.
 
-    `floor_ratio` is what copying the bytes takes that a reprojection must read and write. With a GPU, `batched_*` are
-    costs per frame of a batch there. `offline_codec_share` is the part of `symview-add-views` spent in reading,
-    decoding, encoding and writing, for images with a real camera's noise; `offline_two_process_speedup` what a second
-    process gains, start-up included, of which the first round has most; `frames_per_s` what one process makes of both
-    views. These have quartiles, too.
+    Returns:
+        Medians, with the quartiles as `_low` and `_high`. `*_ratio`: a view's time over that of `cv2.warpPerspective`.
+        `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `batched_*`, on a
+        GPU: time per frame of a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on
+        reading, decoding, encoding and writing, for images with a real camera's noise. `offline_two_process_speedup`:
+        speed-up by a second process including its start-up, most of which falls into the first round. `frames_per_s`:
+        frames for which one process makes both views.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -91,13 +93,13 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
 
 
 def _on_a_gpu(repeats: int) -> dict[str, float]:
-    import torch  # not above: worker processes import this module, and torch takes longer than their work
+    import torch  # imported here: worker processes import this module, and torch takes longer than their work
 
     return batched_ratios(_frame(), repeats, "cuda") if torch.cuda.is_available() else {}
 
 
 def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
-    """Return what a frame of a batch of 64 costs on `device`, and that over copying there what it reads and writes."""
+    """Return the time per frame of a batch of 64 on `device`, in microseconds and over that of copying its bytes."""
     import torch
 
     from lerobot_symview.views.torch_backend import FrameBatch, render_batch
@@ -112,8 +114,8 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
     gripper = torch.as_tensor(frame.gripper)[None].expand(BATCH, -1)
     cameras = [frame.camera] * BATCH
     batch = FrameBatch(rgb.to(device), depth.to(device), cameras, frame.workspace, gripper.to(device))
-    moved = torch.empty(BATCH * _moved_bytes(frame), dtype=torch.uint8, device=device)
-    target = torch.empty_like(moved)
+    source = torch.empty(BATCH * _bytes_moved(frame), dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
 
     def finished(call: Callable[[], object]) -> float:
         def whole() -> None:
@@ -129,14 +131,14 @@ def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
         view = make_view(view_name, **options)
         render = partial(render_batch, view, batch)
         render()
-        times = [(finished(render), finished(lambda: target.copy_(moved))) for _ in range(repeats)]
-        results[f"batched_{name}_us"] = 1e6 * statistics.median(one for one, _ in times) / BATCH
-        results[f"batched_{name}_copy_ratio"] = statistics.median(one / copy for one, copy in times)
+        times = [(finished(render), finished(lambda: target.copy_(source))) for _ in range(repeats)]
+        results[f"batched_{name}_us"] = 1e6 * statistics.median(render_s for render_s, _ in times) / BATCH
+        results[f"batched_{name}_copy_ratio"] = statistics.median(render_s / copy_s for render_s, copy_s in times)
     return results
 
 
-def _moved_bytes(frame: Frame) -> int:
-    """Return how many bytes a reprojection must read and write."""
+def _bytes_moved(frame: Frame) -> int:
+    """Return the bytes that a reprojection reads and writes."""
     assert frame.depth is not None
     return frame.rgb.nbytes + frame.depth.nbytes + make_view("reproj").size ** 2 * 7  # colour and float height
 
@@ -159,9 +161,9 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
     def warp() -> None:
         cv2.warpPerspective(frame.rgb, homography, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
-    moved = np.empty(_moved_bytes(frame), dtype=np.uint8)
-    target = np.empty_like(moved)
-    candidates: dict[str, Callable[[], object]] = {"floor": lambda: np.copyto(target, moved)}
+    source = np.empty(_bytes_moved(frame), dtype=np.uint8)
+    target = np.empty_like(source)
+    candidates: dict[str, Callable[[], object]] = {"floor": lambda: np.copyto(target, source)}
     for name, (view_name, options) in VIEWS.items():
         view = make_view(view_name, **options)
         candidates[name] = lambda view=view: view.render(frame)  # type: ignore[misc]
@@ -180,15 +182,16 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
 
 
 def _median_and_quartiles(name: str, values: list[float]) -> dict[str, float]:
-    # inclusive: no quartile lies outside of what was measured
+    # inclusive: no quartile lies outside of the measured values
     low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
     return {name: median, f"{name}_low": low, f"{name}_high": high}
 
 
 def _offline(frames: int, rounds: int) -> dict[str, float]:
-    found: dict[str, list[float]] = {"offline_codec_share": [], "offline_two_process_speedup": [], "frames_per_s": []}
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    names = ("offline_codec_share", "offline_two_process_speedup", "frames_per_s")
+    values: dict[str, list[float]] = {name: [] for name in names}
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
         recorded, source = _repeated_dataset(folder, frames)
         total = SourceDataset(source).info["total_frames"]
 
@@ -208,10 +211,10 @@ def _offline(frames: int, rounds: int) -> dict[str, float]:
         for _ in range(rounds):
             with _codec_clocks() as clocks:
                 alone = add(source)
-            found["offline_codec_share"].append(sum(clock.milliseconds for clock in clocks) / 1000 / alone)
-            found["offline_two_process_speedup"].append(alone / add(source, num_workers=2))
-            found["frames_per_s"].append(total / alone)
-    return {key: value for name, values in found.items() for key, value in _median_and_quartiles(name, values).items()}
+            values["offline_codec_share"].append(sum(clock.milliseconds for clock in clocks) / 1000 / alone)
+            values["offline_two_process_speedup"].append(alone / add(source, num_workers=2))
+            values["frames_per_s"].append(total / alone)
+    return {key: value for name in names for key, value in _median_and_quartiles(name, values[name]).items()}
 
 
 def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
@@ -236,7 +239,7 @@ def _repeated_dataset(folder: Path, frames: int) -> tuple[Path, Path]:
 
 
 def _add_noise(file: Path, key: str) -> None:
-    """Make a table's colour images as hard to compress as a camera's, whose pixels are never quite alike."""
+    """Add noise to a table's colour images, which makes them as hard to compress as a real camera's."""
     table, rng = pq.read_table(file), np.random.default_rng(0)
     cells = table[key].to_pylist()
     for cell in cells:

@@ -1,1 +1,1 @@
-"""The paper's tables and figures, rerun at a stated scale."""
+"""The command `symview-experiment`: reruns the paper's tables and figures at a chosen scale."""

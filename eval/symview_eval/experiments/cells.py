@@ -1,4 +1,4 @@
-"""A cell of an experiment, from its demonstrations to its results; what worker processes run."""
+"""Runs one cell of an experiment in a worker process: demonstrations, training, evaluation, results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.runtime.cli import CommandError
-from symview_eval.experiments.cloning import clone
+from symview_eval.experiments.cloning import run_cloning
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
@@ -35,67 +35,67 @@ RL_SIMULATORS = 5
 
 
 @dataclass(frozen=True)
-class Job:
-    """A cell and where it is done."""
+class CellJob:
+    """A cell, and the folders and device that it uses."""
 
     cell: Cell
     results: Path
-    """Folder of all results."""
+    """Folder of the results of all cells."""
     folder: Path
-    """Folder of recordings and policies."""
+    """Folder of the recordings and policies of all cells."""
     device: str
-    """Of the networks."""
+    """PyTorch device of the networks."""
 
     @property
     def demonstrations(self) -> NewDataset:
-        """What the cell learns from."""
+        """Location of the cell's demonstrations."""
         name = self.cell.recording
         return NewDataset(f"symview/{name}", self.folder / "recordings" / name)
 
     @property
     def output(self) -> Path:
-        """Folder of its policy."""
+        """Folder of the cell's policy."""
         return self.folder / "policies" / self.cell.path.with_suffix("")
 
 
 @dataclass(frozen=True)
-class Done:
-    """What became of a job."""
+class Outcome:
+    """Whether a job succeeded, and its wall-clock time in seconds."""
 
     cell: Cell
     seconds: float
     failure: str = ""
-    """Why there is no result; empty if there is one."""
+    """Type and message of the error; empty if the job succeeded."""
 
 
-def record(job: Job) -> Done:
-    """Make a cell's demonstrations, unless they are there already."""
+def record_demonstrations(job: CellJob) -> Outcome:
+    """Record a cell's demonstrations, unless they exist."""
     return _attempt(job, _record)
 
 
-def run_cell(job: Job) -> Done:
-    """Train and evaluate a cell's policy; write its results and keep the policy."""
-    torch.set_num_threads(1)  # sums of more would differ in their last bits, and with them what is learned
+def run_cell(job: CellJob) -> Outcome:
+    """Train and evaluate a cell's policy; save its results and the policy."""
+    torch.set_num_threads(1)  # with more, sums differ in their last bits and so do trained weights
     return _attempt(job, _run)
 
 
-def _attempt(job: Job, work: Callable[[Job], None]) -> Done:
+def _attempt(job: CellJob, work: Callable[[CellJob], None]) -> Outcome:
     start = time.perf_counter()
     try:
         work(job)
-    except Exception as error:  # whatever it is, the other cells go on and the user is told
+    except Exception as error:  # any error: the other cells continue and the command reports it
         logger.debug("%s", traceback.format_exc())
-        return Done(job.cell, time.perf_counter() - start, f"{type(error).__name__}: {error}")
-    return Done(job.cell, time.perf_counter() - start)
+        return Outcome(job.cell, time.perf_counter() - start, f"{type(error).__name__}: {error}")
+    return Outcome(job.cell, time.perf_counter() - start)
 
 
-def _record(job: Job) -> None:
+def _record(job: CellJob) -> None:
     cell = job.cell
     env = RecordedEnv(task=cell.task, camera=CameraSpec(elevation_deg=cell.row.elevation_deg))
     generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
 
 
-def _run(job: Job) -> None:
+def _run(job: CellJob) -> None:
     cell, start = job.cell, time.perf_counter()
     env = EnvSettings(
         task=cell.task,
@@ -105,10 +105,10 @@ def _run(job: Job) -> None:
     )
     times = Times()
     if cell.algorithm == "sacfd":
-        checkpoints = _reinforce(job, env)
+        checkpoints = _run_rl(job, env)
     else:
-        cloned = clone(cell, open_dataset(job.demonstrations), env, job.device)
-        checkpoints, actor, times = cloned.checkpoints, cloned.actor, cloned.times
+        training = run_cloning(cell, open_dataset(job.demonstrations), env, job.device)
+        checkpoints, actor, times = training.checkpoints, training.actor, training.times
         for part in (actor.policy, actor.preprocessor, actor.postprocessor):
             part.save_pretrained(job.output / "pretrained_model")
     origin = Origin(
@@ -122,8 +122,8 @@ def _run(job: Job) -> None:
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
 
 
-def _reinforce(job: Job, env: EnvSettings) -> list[Checkpoint]:
-    """Run `symview-train-rl`, or go on with it, and return its evaluations."""
+def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
+    """Start or resume `symview-train-rl` for a cell, and return its evaluations."""
     cell, scale = job.cell, job.cell.scale
     config = TrainRlConfig(
         dataset=job.demonstrations,
@@ -140,8 +140,8 @@ def _reinforce(job: Job, env: EnvSettings) -> list[Checkpoint]:
     )
     try:
         last_checkpoint(config)
-    except CommandError as error:  # none yet, or of other settings
-        logger.info("%s is trained from the beginning: %s", cell, error)
+    except CommandError as error:  # no checkpoint yet, or one with other settings
+        logger.info("%s: training starts from the beginning: %s", cell, error)
         shutil.rmtree(job.output, ignore_errors=True)
         config = replace(config, resume=False)
     train_rl(config)

@@ -1,4 +1,4 @@
-"""Behaviour cloning with its demonstrations in memory, evaluated in simulators while it goes on."""
+"""Behaviour cloning with the demonstrations in memory, and evaluation in simulators in parallel with the training."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from symview_sim.simulators import Simulators
 
 
 @dataclass(frozen=True)
-class Cloned:
-    """What came of a training."""
+class CloningResult:
+    """Evaluations, policy and times of a training."""
 
     checkpoints: list[Checkpoint]
     actor: Actor
@@ -40,11 +40,11 @@ class Cloned:
 
 
 class Demonstrations:
-    """Frames that a policy's network needs, and the actions, on its device.
+    """A dataset's inputs of a policy's network and its actions, on the policy's device.
 
     Args:
-        dataset: a `LeRobotDataset` with what the camera saw.
-        actor: the policy, whose view is made once here.
+        dataset: a `LeRobotDataset` with the camera's images.
+        actor: the policy; its preprocessor, which renders the view, runs once per frame.
     """
 
     def __init__(self, dataset: Any, actor: Actor):
@@ -61,7 +61,7 @@ class Demonstrations:
         self._actions = torch.cat(actions).to(self._device)
 
     def batches(self, size: int, seed: int) -> Iterator[dict[str, Tensor]]:
-        """Yield batches without end: every frame once, in random order, before any comes again."""
+        """Yield batches of `size` frames without end; each pass visits every frame once in random order."""
         generator = torch.Generator().manual_seed(seed)
         order = torch.empty(0, dtype=torch.long)
         while True:
@@ -73,13 +73,13 @@ class Demonstrations:
 
 
 class Evaluator:
-    """Evaluates policies as they are now, one after the other, while their training goes on.
+    """Evaluates copies of a policy in a thread, one after the other, while its training continues.
 
     Args:
-        simulators: where.
-        episodes: of each evaluation.
-        first_seed: of their scenes, which are others in every evaluation.
-        discount: of returns.
+        simulators: the simulators that run the episodes.
+        episodes: episodes per evaluation.
+        first_seed: seed of the first scene; later scenes and evaluations have the following seeds.
+        discount: discount factor of the returns.
     """
 
     def __init__(self, simulators: Simulators, episodes: int, first_seed: int, discount: float):
@@ -95,20 +95,20 @@ class Evaluator:
         self._thread.shutdown(cancel_futures=True)
 
     def submit(self, policy: SymviewBcPolicy) -> Future[Evaluation]:
-        """Have a copy of a policy evaluated."""
+        """Evaluate a copy of a policy with its present weights."""
         seeds = range(self._next_seed, self._next_seed + self._episodes)
         self._next_seed += self._episodes
         return self._thread.submit(self._evaluate, Actor(deepcopy(policy)), seeds)
 
     def _evaluate(self, actor: Actor, seeds: Sequence[int]) -> Evaluation:
         start = time.perf_counter()
-        found = evaluate(actor, self._simulators, seeds, self._discount)
+        evaluation = evaluate(actor, self._simulators, seeds, self._discount)
         self.seconds += time.perf_counter() - start
-        return found
+        return evaluation
 
 
 def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
-    """Return the policy of a cell."""
+    """Return the configuration of a cell's policy."""
     config = SymviewBcConfig(
         device=device,
         push_to_hub=False,
@@ -120,8 +120,15 @@ def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
     return config
 
 
-def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Cloned:
-    """Train and evaluate a cell's policy, with LeRobot's own update."""
+def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> CloningResult:
+    """Train a cell's policy with LeRobot's own update, and evaluate it at every checkpoint.
+
+    Args:
+        cell: the cell.
+        dataset: `LeRobotDataset` of its demonstrations.
+        env: environment of the evaluations.
+        device: PyTorch device of the network.
+    """
     scale = cell.scale
     begin, begin_cpu = time.perf_counter(), time.process_time()
     set_seed(cell.seed)
@@ -157,14 +164,14 @@ def clone(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Cloned:
             evaluation_s=evaluator.seconds,
             cpu_s=time.process_time() - begin_cpu + simulators.cpu_seconds(),
         )
-        return Cloned(checkpoints, actor, times)
+        return CloningResult(checkpoints, actor, times)
 
 
-def _checkpoint(step: int, loss: float, found: Evaluation) -> Checkpoint:
-    return Checkpoint(step, sum(found.success), len(found.success), found.mean_return, loss)
+def _checkpoint(step: int, loss: float, evaluation: Evaluation) -> Checkpoint:
+    return Checkpoint(step, sum(evaluation.success), len(evaluation.success), evaluation.mean_return, loss)
 
 
 def _metrics(batch_size: int) -> Any:
-    """Return what LeRobot's update writes its measures into."""
+    """Return the tracker that LeRobot's update writes its metrics into."""
     meters = {name: AverageMeter(name, ":.3f") for name in ("loss", "grad_norm", "lr", "update_s", "gpu_mem_gb")}
     return MetricsTracker(batch_size, 1, 1, meters)

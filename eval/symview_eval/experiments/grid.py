@@ -1,4 +1,4 @@
-"""What the paper compares: the rows, tasks and numbers of demonstrations of its tables and figures."""
+"""The paper's tables and figures: methods, tasks and numbers of demonstrations, and the cells they consist of."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 
 Algorithm = Literal["bc", "sacfd"]
-ELEVATION = 45.0  # degrees: the paper's camera, unless it says otherwise
+ELEVATION = 45.0  # degrees above the table: the paper's default camera
 HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps, for SACfD
 RL_DEMONSTRATIONS, RL_DEMONSTRATIONS_HARDER = 20, 50
 
 
 @dataclass(frozen=True)
-class Row:
-    """A method as one line of a table."""
+class MethodRow:
+    """A method, one row of a table."""
 
     name: str
-    """Its folder among the results."""
+    """Name of its result folder."""
     label: str
-    """As the paper prints it."""
+    """Its name in the paper."""
     policy: dict[str, Any] = field(hash=False)
-    """Settings of the policy: `method`, and what differs from it."""
+    """Policy settings: `method`, and overrides of that method's settings."""
     elevation_deg: float = ELEVATION
-    """Of the camera, degrees above the table."""
+    """Elevation of the camera, degrees above the table."""
 
     @property
     def policy_options(self) -> dict[str, Any]:
@@ -45,24 +45,24 @@ class Row:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table or figure."""
+    """A table or figure of the paper."""
 
     name: str
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[MethodRow, ...]
     tasks: tuple[str, ...]
     demonstrations: tuple[int, ...] = (5, 10, 50)
-    """Of behaviour cloning; reinforcement learning has as many as the paper gives each task."""
+    """Numbers of demonstrations for behaviour cloning; for reinforcement learning the paper fixes one per task."""
     algorithm: Algorithm = "bc"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One training with its evaluations."""
+    """One training run and its evaluations."""
 
     experiment: str
     algorithm: Algorithm
-    row: Row
+    row: MethodRow
     task: str
     demonstrations: int
     seed: int
@@ -70,54 +70,54 @@ class Cell:
 
     @property
     def path(self) -> Path:
-        """File of its results, in the folder of all results."""
-        place = Path(self.experiment, self.scale.name, self.task, self.row.name, str(self.demonstrations))
-        return place / f"{self.seed}.csv"
+        """Its result file, relative to the results folder."""
+        folder = Path(self.experiment, self.scale.name, self.task, self.row.name, str(self.demonstrations))
+        return folder / f"{self.seed}.csv"
 
     @property
     def recording(self) -> str:
-        """Name of its demonstrations, which every method learns from."""
+        """Name of its demonstrations, which all methods with the same camera share."""
         return f"{self.task}_{self.row.elevation_deg:g}deg_{self.demonstrations}_seed{self.seed}"
 
     @property
     def steps(self) -> int:
-        """Training steps, joint ones for reinforcement learning."""
+        """Training steps of behaviour cloning, or joint steps of reinforcement learning."""
         if self.algorithm == "bc":
             return self.scale.steps
         return self.scale.rl_steps * (2 if self.task in HARDER_TASKS else 1)
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """What determines its results, but for versions and the machine."""
-        shared = self.scale
-        evaluation = [shared.eval_every if self.algorithm == "bc" else shared.rl_eval_every, shared.eval_episodes]
+        """All settings that determine its results; versions and the machine are not among them."""
+        scale = self.scale
+        evaluation = [scale.eval_every if self.algorithm == "bc" else scale.rl_eval_every, scale.eval_episodes]
         return {
             "algorithm": self.algorithm,
-            "policy": {**shared.policy, **self.row.policy},
-            "learning_rate_decay": shared.learning_rate_decay if self.algorithm == "bc" else "none",
+            "policy": {**scale.policy, **self.row.policy},
+            "learning_rate_decay": scale.learning_rate_decay if self.algorithm == "bc" else "none",
             "elevation_deg": self.row.elevation_deg,
             "task": self.task,
             "demonstrations": self.demonstrations,
             "seed": self.seed,
             "steps": self.steps,
-            "batch_size": shared.batch_size,
-            "evaluation": [*evaluation, shared.max_steps],
+            "batch_size": scale.batch_size,
+            "evaluation": [*evaluation, scale.max_steps],
         }
 
     @property
     def configuration_hash(self) -> str:
-        """Of `configuration`: equal for cells of two tables that are one run."""
+        """Hash of `configuration`. Cells of two tables with equal hashes share one run."""
         return hashlib.sha256(json.dumps(self.configuration, sort_keys=True).encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
         return f"{self.row.name} on {self.task}, {self.demonstrations} demonstrations, seed {self.seed}"
 
 
-def _row(name: str, label: str, method: str | None = None, elevation_deg: float = ELEVATION, **policy: Any) -> Row:
-    return Row(name, label, {"method": method or name, **policy}, elevation_deg)
+def _row(name: str, label: str, method: str | None = None, **policy: Any) -> MethodRow:
+    return MethodRow(name, label, {"method": method or name, **policy})
 
 
-def _rgb(method: str, label: str) -> Row:
+def _rgb(method: str, label: str) -> MethodRow:
     return _row(f"{method}_rgb", label, method, modality="rgb")
 
 
@@ -129,14 +129,14 @@ VOXEL, CLOUD = _row("voxel_equi", "Voxel Equi"), _row("point_cloud_equi", "Point
 
 CLONED_TASKS = ("block_picking", "block_pushing", "drawer_opening", "block_stacking", "block_in_bowl")
 ABLATION_TASKS = ("drawer_opening", "block_stacking", "block_in_bowl")
-ANGLES = (15.0, 30.0, 45.0, 60.0, 75.0)
+ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
 
 
-def _seen_from(row: Row, elevation_deg: float) -> Row:
-    return Row(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, elevation_deg)
+def _at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
+    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, elevation_deg)
 
 
-def _plane(name: str, label: str, plane_height: float | str) -> Row:
+def _with_plane_height(name: str, label: str, plane_height: float | str) -> MethodRow:
     return _row(name, label, "persp_equi_broken", view_options={"plane_height": plane_height})
 
 
@@ -173,7 +173,7 @@ EXPERIMENTS = {
             "table4",
             "Infill of the reprojected view",
             (
-                Row(REPROJ.name, "Nearest Interpolation", REPROJ.policy),
+                MethodRow(REPROJ.name, "Nearest Interpolation", REPROJ.policy),
                 _row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
                 _row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),
             ),
@@ -181,12 +181,12 @@ EXPERIMENTS = {
         ),
         Experiment(
             "table5",
-            "Height of the plane of the perspective view",
+            "Plane height of the perspective view",
             (
                 _row("persp_equi_broken", "0.0 cm"),
-                _plane("persp_equi_broken_2.5cm", "2.5 cm", 0.025),
-                _plane("persp_equi_broken_5cm", "5.0 cm", 0.05),
-                _plane("persp_equi_broken_dynamic", "dynamic", "gripper"),
+                _with_plane_height("persp_equi_broken_2.5cm", "2.5 cm", 0.025),
+                _with_plane_height("persp_equi_broken_5cm", "5.0 cm", 0.05),
+                _with_plane_height("persp_equi_broken_dynamic", "dynamic", "gripper"),
             ),
             ABLATION_TASKS,
             (10,),
@@ -207,10 +207,10 @@ EXPERIMENTS = {
         ),
         Experiment(
             "figure7",
-            "Angle of the camera",
+            "Elevation of the camera",
             (
-                *(_seen_from(row, angle) for row in (REPROJ, SIDE, PLAIN) for angle in ANGLES),
-                *(_seen_from(row, angle) for row in (PERSP, SIDE_RGB, PLAIN_RGB) for angle in ANGLES),
+                *(_at_elevation(row, elevation) for row in (REPROJ, SIDE, PLAIN) for elevation in ELEVATIONS),
+                *(_at_elevation(row, elevation) for row in (PERSP, SIDE_RGB, PLAIN_RGB) for elevation in ELEVATIONS),
                 ORACLE,
                 ORACLE_RGB,
             ),
@@ -219,7 +219,7 @@ EXPERIMENTS = {
         ),
     )
 }
-"""`figure7` compares with the oracle, whose camera hangs at 90 degrees."""
+"""Name -> experiment. In `figure7` the oracle's camera has an elevation of 90 degrees."""
 
 
 def select(
@@ -230,10 +230,18 @@ def select(
     demos: Sequence[int] = (),
     seeds: Sequence[int] = (),
 ) -> list[Cell]:
-    """Return the cells of an experiment, all or the named ones, seed by seed: every method's first seed comes first.
+    """Return the cells of an experiment, seed by seed, so that every method's first seed runs first.
+
+    Args:
+        experiment: the experiment.
+        scale: size of its runs.
+        tasks: tasks to select; empty selects all. The same holds for the arguments below.
+        methods: names of method rows.
+        demos: numbers of demonstrations.
+        seeds: seeds.
 
     Raises:
-        ValueError: if it has no such task or method.
+        ValueError: if the experiment has no such task or method.
     """
     rows = {row.name: row for row in experiment.rows}
     chosen_tasks = [lookup("--tasks entry", task, dict.fromkeys(experiment.tasks)) or task for task in tasks]

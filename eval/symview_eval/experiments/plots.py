@@ -1,4 +1,4 @@
-"""Pictures of results."""
+"""Plots of results."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from matplotlib.figure import Figure
 
 from symview_eval.experiments.grid import Experiment
 from symview_eval.experiments.results import Result
-from symview_eval.experiments.summary import Entry
+from symview_eval.experiments.summary import TableEntry
 
-OURS, THEIRS = "#1f5fa8", "#c2571a"
+MEASURED_COLOR, PAPER_COLOR = "#1f5fa8", "#c2571a"
 
 
-def plot(experiment: Experiment, scale: str, found: Sequence[Entry]) -> Figure:
-    """Return the picture that suits an experiment: learning curves, success by angle, or success by row."""
+def plot(experiment: Experiment, scale: str, entries: Sequence[TableEntry]) -> Figure:
+    """Return an experiment's plot: learning curves (SACfD), success by elevation (figure 7) or success by method."""
     if experiment.algorithm == "sacfd":
-        figure = _curves(found)
+        figure = _curves(entries)
     else:
-        figure = _angles(found) if experiment.name == "figure7" else _rows(found)
+        figure = _elevations(entries) if experiment.name == "figure7" else _rows(entries)
     figure.suptitle(f"{experiment.title} ({experiment.name}), scale {scale}", fontsize=10)
     return figure
 
 
-def _panels(found: Sequence[Entry], height: float) -> tuple[Figure, dict[tuple[str, int], Any]]:
-    """Return a panel for every task and number of demonstrations."""
-    names = list(dict.fromkeys((entry.task, entry.demonstrations) for entry in found))
+def _panels(entries: Sequence[TableEntry], height: float) -> tuple[Figure, dict[tuple[str, int], Any]]:
+    """Return a figure, and its axes by task and number of demonstrations."""
+    names = list(dict.fromkeys((entry.task, entry.demonstrations) for entry in entries))
     columns = min(3, len(names))
     rows = math.ceil(len(names) / columns)
     figure = Figure(figsize=(4.6 * columns, height * rows), layout="constrained")
@@ -41,58 +41,58 @@ def _panels(found: Sequence[Entry], height: float) -> tuple[Figure, dict[tuple[s
     return figure, dict(zip(names, axes, strict=False))
 
 
-def _rows(found: Sequence[Entry]) -> Figure:
-    figure, panels = _panels(found, 2.6)
-    for place, axis in panels.items():
-        shown = [entry for entry in found if (entry.task, entry.demonstrations) == place][::-1]
-        for y, entry in enumerate(shown):
+def _rows(entries: Sequence[TableEntry]) -> Figure:
+    figure, panels = _panels(entries, 2.6)
+    for group, axis in panels.items():
+        rows = [entry for entry in entries if (entry.task, entry.demonstrations) == group][::-1]
+        for y, entry in enumerate(rows):
             low, high = (100 * end for end in (entry.last_five.low, entry.last_five.high))
-            axis.plot([low, high], [y, y], color=OURS, alpha=0.35, linewidth=6, solid_capstyle="butt")
-            axis.plot(100 * entry.last_five.mean, y, "|", color=OURS, markersize=12, markeredgewidth=2)
-            axis.plot(100 * entry.best.mean, y, "o", color=OURS)
-            axis.plot(100 * entry.paper, y, "D", color=THEIRS, fillstyle="none")
-        axis.set_yticks(range(len(shown)), [entry.row.label for entry in shown], fontsize=9)
-        axis.set_ylim(-0.6, len(shown) - 0.4)
+            axis.plot([low, high], [y, y], color=MEASURED_COLOR, alpha=0.35, linewidth=6, solid_capstyle="butt")
+            axis.plot(100 * entry.last_five.mean, y, "|", color=MEASURED_COLOR, markersize=12, markeredgewidth=2)
+            axis.plot(100 * entry.best.mean, y, "o", color=MEASURED_COLOR)
+            axis.plot(100 * entry.paper, y, "D", color=PAPER_COLOR, fillstyle="none")
+        axis.set_yticks(range(len(rows)), [entry.row.label for entry in rows], fontsize=9)
+        axis.set_ylim(-0.6, len(rows) - 0.4)
         axis.set_xlim(-2, 102)
         axis.set_xlabel("success, %", fontsize=9)
     _legend(
         figure,
         [
-            {"marker": "o", "color": OURS, "label": "best checkpoint"},
-            {"marker": "|", "color": OURS, "markersize": 12, "label": "mean of the last five, 95 %"},
-            {"marker": "D", "color": THEIRS, "fillstyle": "none", "label": "paper (best)"},
+            {"marker": "o", "color": MEASURED_COLOR, "label": "best checkpoint"},
+            {"marker": "|", "color": MEASURED_COLOR, "markersize": 12, "label": "last five, mean and 95 % interval"},
+            {"marker": "D", "color": PAPER_COLOR, "fillstyle": "none", "label": "paper, best checkpoint"},
         ],
     )
     return figure
 
 
-def _angles(found: Sequence[Entry]) -> Figure:
-    figure, panels = _panels(found, 3.2)
-    for place, axis in panels.items():
-        series: dict[str, list[Entry]] = {}
-        for entry in found:
-            if (entry.task, entry.demonstrations) == place:
+def _elevations(entries: Sequence[TableEntry]) -> Figure:
+    figure, panels = _panels(entries, 3.2)
+    for group, axis in panels.items():
+        series: dict[str, list[TableEntry]] = {}
+        for entry in entries:
+            if (entry.task, entry.demonstrations) == group:
                 modality = "RGB" if entry.row.policy.get("modality") == "rgb" or "persp" in entry.row.name else "RGBD"
                 series.setdefault(f"{entry.row.label.split(',')[0]} ({modality})", []).append(entry)
         for label, members in series.items():
             is_oracle = "Oracle" in label
-            angles = [90.0 if is_oracle else entry.row.elevation_deg for entry in members]
+            elevations = [90.0 if is_oracle else entry.row.elevation_deg for entry in members]
             estimates = [entry.last_five for entry in members]
             rates = [100 * estimate.mean for estimate in estimates]
             below = [100 * (estimate.mean - estimate.low) for estimate in estimates]
             above = [100 * (estimate.high - estimate.mean) for estimate in estimates]
             marker = "*" if is_oracle else "o"
-            axis.errorbar(angles, rates, yerr=[below, above], marker=marker, capsize=2, label=label)
-        axis.set_xlabel("camera's angle above the table, degrees", fontsize=9)
-        axis.set_ylabel("success, %, mean of the last five", fontsize=9)
+            axis.errorbar(elevations, rates, yerr=[below, above], marker=marker, capsize=2, label=label)
+        axis.set_xlabel("camera elevation, degrees", fontsize=9)
+        axis.set_ylabel("success, %, mean of the last five checkpoints", fontsize=9)
         axis.set_ylim(0, 100)
         axis.legend(fontsize=7)
     return figure
 
 
-def _curves(found: Sequence[Entry]) -> Figure:
-    figure, panels = _panels(found, 3.0)
-    for entry in found:
+def _curves(entries: Sequence[TableEntry]) -> Figure:
+    figure, panels = _panels(entries, 3.0)
+    for entry in entries:
         axis = panels[entry.task, entry.demonstrations]
         steps, means, spreads = _mean_curve(entry.results)
         (line,) = axis.plot(steps, means, marker=".", label=entry.row.label)
@@ -107,7 +107,7 @@ def _curves(found: Sequence[Entry]) -> Figure:
 
 
 def _mean_curve(results: Sequence[Result]) -> tuple[list[int], list[float], list[float]]:
-    """Return steps, mean returns and standard deviations over seeds, of the steps that all seeds reached."""
+    """Return steps, and mean and standard deviation of the return over seeds, for the steps that all seeds reached."""
     columns = list(zip(*([point.mean_return for point in result.checkpoints] for result in results), strict=False))
     steps = [point.step for point in results[0].checkpoints[: len(columns)]]
     return steps, [statistics.fmean(column) for column in columns], [statistics.pstdev(column) for column in columns]

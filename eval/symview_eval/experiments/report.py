@@ -1,4 +1,4 @@
-"""Tables and plots of the results there are, beside the paper's values."""
+"""Report of all results: tables and plots with the paper's values, as HTML, Markdown and PNG."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from symview_eval.contact_sheet import data_uri
 from symview_eval.experiments.grid import EXPERIMENTS, Experiment
 from symview_eval.experiments.scale import SCALES, Scale
 from symview_eval.experiments.summary import (
-    Entry,
-    Ordering,
-    entries,
+    MethodPair,
+    TableEntry,
     is_current,
-    measured_scales,
-    orderings,
+    method_pairs,
+    scales_with_results,
+    table_entries,
 )
 
 logger = logging.getLogger(__name__)
@@ -28,45 +28,47 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """Rebuild tables and plots from raw results."""
+    """Rebuild the report's tables and plots from the raw results."""
 
     results_dir: Path = Path("results")
-    """Where they are."""
+    """Folder of the raw results."""
     output_dir: Path = Path("outputs/report")
-    """Where `report.html`, `report.md` and a PNG file for every table and figure go."""
+    """Folder for `report.html`, `report.md` and one PNG file per table or figure and scale."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A table or figure at one scale."""
+    """Results of a table or figure at one scale."""
 
     experiment: Experiment
     scale: Scale
-    entries: list[Entry]
-    stale: list[Entry]
-    """Of these, the ones whose configuration is no longer the experiment's."""
-    orderings: list[Ordering]
-    picture: bytes
+    entries: list[TableEntry]
+    stale_entries: list[TableEntry]
+    """Entries with results of another configuration than the experiment's present one."""
+    pairs: list[MethodPair]
+    plot_png: bytes
+    """The plot as a PNG file."""
 
     @property
     def name(self) -> str:
-        """Of its picture."""
+        """Name of the plot's file without its suffix."""
         return f"{self.experiment.name}_{self.scale.name}"
 
     @property
-    def reversed(self) -> list[Ordering]:
-        """Pairs of rows that are the other way round here, or level, largest difference in the paper first."""
-        return sorted((pair for pair in self.orderings if pair.found <= 0), key=lambda pair: -pair.stated)
+    def reversed_pairs(self) -> list[MethodPair]:
+        """Pairs whose measured order is reversed or level, largest difference in the paper first."""
+        reversed_pairs = (pair for pair in self.pairs if pair.measured_difference <= 0)
+        return sorted(reversed_pairs, key=lambda pair: -pair.paper_difference)
 
     @property
     def machines(self) -> list[str]:
-        """What the results were computed on."""
+        """Machines and package versions of the results."""
         origins = (result.origin for entry in self.entries for result in entry.results)
         return sorted({f"{origin.machine} (version {origin.version})" for origin in origins})
 
 
 def report(config: ReportConfig) -> Path:
-    """Write the report and return its page.
+    """Write the report and return the path of its HTML page.
 
     Raises:
         CommandError: if there are no results.
@@ -74,15 +76,15 @@ def report(config: ReportConfig) -> Path:
     sections = [
         _section(experiment, scale, config.results_dir)
         for experiment in EXPERIMENTS.values()
-        for scale in measured_scales(experiment, config.results_dir)
+        for scale in scales_with_results(experiment, config.results_dir)
     ]
     if not sections:
         raise CommandError(
-            f"there are no results in {config.results_dir}: run symview-experiment table1 first, or see --results_dir"
+            f"no results in {config.results_dir}: run symview-experiment table1 first, or check --results_dir"
         )
     config.output_dir.mkdir(parents=True, exist_ok=True)
     for section in sections:
-        (config.output_dir / f"{section.name}.png").write_bytes(section.picture)
+        (config.output_dir / f"{section.name}.png").write_bytes(section.plot_png)
     templates = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"),
         autoescape=jinja2.select_autoescape(["html"]),
@@ -99,20 +101,20 @@ def report(config: ReportConfig) -> Path:
 
 
 def percent(rate: float) -> str:
-    """Return a rate in percent, nothing if there is none."""
+    """Format a rate in [0, 1] as percent; an empty string for nan."""
     return "" if math.isnan(rate) else f"{100 * rate:.1f}"
 
 
 def points(difference: float) -> str:
-    """Return a difference of rates in percentage points with its sign, nothing if there is none."""
+    """Format a difference of rates as signed percentage points; an empty string for nan."""
     return "" if math.isnan(difference) else f"{100 * difference:+.1f}"
 
 
 def _section(experiment: Experiment, scale: str, folder: Path) -> Section:
-    from symview_eval.experiments.plots import plot  # matplotlib, which other commands do not wait for
+    from symview_eval.experiments.plots import plot  # imports matplotlib, which takes long
 
-    found = entries(experiment, scale, folder)
-    stale = [entry for entry in found if not is_current(entry, experiment, scale)]
+    entries = table_entries(experiment, scale, folder)
+    stale = [entry for entry in entries if not is_current(entry, experiment, scale)]
     stream = io.BytesIO()
-    plot(experiment, scale, found).savefig(stream, format="png", dpi=110)
-    return Section(experiment, SCALES[scale], found, stale, orderings(found), stream.getvalue())
+    plot(experiment, scale, entries).savefig(stream, format="png", dpi=110)
+    return Section(experiment, SCALES[scale], entries, stale, method_pairs(entries), stream.getvalue())

@@ -1,4 +1,4 @@
-"""Raw results of cells: a CSV file each, which says what it came from."""
+"""Raw results of cells: one CSV file per cell, with its configuration hash, version, machine and times in comments."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """How well a policy did at some point of its training."""
+    """Evaluation of a policy at one step of its training."""
 
     step: int
     successes: int
     episodes: int
     mean_return: float
-    """Discounted."""
+    """Mean discounted return of the episodes."""
     loss: float
-    """Mean since the checkpoint before; nan where it is not known."""
+    """Mean training loss since the previous checkpoint; nan where it is not recorded."""
 
     @property
     def rate(self) -> float:
@@ -36,41 +36,41 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Times:
-    """Where a cell's time went; nan where that was not measured."""
+    """Seconds that the parts of a cell took; nan where not measured."""
 
     preparation_s: float = math.nan
     """Reading demonstrations, building the policy, starting simulators."""
     training_s: float = math.nan
-    """Training."""
+    """Training steps."""
     waiting_s: float = math.nan
-    """After it, until the last evaluation was done."""
+    """From the end of training to the end of the last evaluation."""
     evaluation_s: float = math.nan
-    """Evaluations, most of it beside the training."""
+    """Evaluations, most of them in parallel with the training."""
     cpu_s: float = math.nan
-    """Processor time of all of it, simulators included."""
+    """CPU time of the whole cell, simulators included."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a result comes from."""
+    """Configuration, software and machine that a result was computed with."""
 
     configuration: str
-    """Hash of everything that determines it."""
+    """`Cell.configuration_hash`."""
     seed: int
-    """Of scenes, demonstrations and training."""
+    """Seed of scenes, demonstrations and training."""
     version: str
-    """Of this package."""
+    """Version of this package."""
     machine: str
-    """What it ran on."""
+    """Operating system, architecture, cores and GPU."""
     seconds: float
-    """From the cell's beginning to its end."""
+    """Wall-clock time of the cell."""
     device: str
-    """Where the networks were."""
+    """PyTorch device of the networks."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a cell."""
+    """Results of a cell."""
 
     origin: Origin
     times: Times
@@ -78,13 +78,13 @@ class Result:
 
 
 def write_result(path: Path, result: Result) -> None:
-    """Write a result, whole or not at all."""
+    """Write a result file atomically."""
     stream = io.StringIO()
     for name, value in (asdict(result.origin) | asdict(result.times)).items():
-        stream.write(f"# {name}: {_shown(value)}\n")
-    writer = csv.DictWriter(stream, [entry.name for entry in fields(Checkpoint)], lineterminator="\n")
+        stream.write(f"# {name}: {_text(value)}\n")
+    writer = csv.DictWriter(stream, [column.name for column in fields(Checkpoint)], lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _shown(value) for name, value in asdict(point).items()} for point in result.checkpoints)
+    writer.writerows({name: _text(value) for name, value in asdict(point).items()} for point in result.checkpoints)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     part.write_text(stream.getvalue())
@@ -92,52 +92,54 @@ def write_result(path: Path, result: Result) -> None:
 
 
 def read_result(path: Path) -> Result:
-    """Return what `write_result` wrote.
+    """Read a result file.
 
     Raises:
-        ValueError: if the file is something else.
+        ValueError: if the file is not one that `write_result` wrote.
     """
     lines = path.read_text().splitlines()
-    stated = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
+    header = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     try:
-        checkpoints = [Checkpoint(**_fields(Checkpoint, row)) for row in rows]
-        return Result(Origin(**_fields(Origin, stated)), Times(**_fields(Times, stated)), checkpoints)
+        checkpoints = [Checkpoint(**_parsed(Checkpoint, row)) for row in rows]
+        return Result(Origin(**_parsed(Origin, header)), Times(**_parsed(Times, header)), checkpoints)
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path} is not a result of symview-experiment: {error!r}") from None
+        raise ValueError(
+            f"{path} is not a result of symview-experiment, delete it to run the cell again: {error!r}"
+        ) from None
 
 
-def unfinished(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> Iterator[Cell]:
-    """Yield the cells that have no result yet; what another table has the result of is copied from there.
+def unfinished_cells(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> Iterator[Cell]:
+    """Yield the cells that have no result; copy a result of the same configuration from another table.
 
     Args:
-        cells: to look for.
-        folder: of all results.
-        configurations: hash -> file of every result there is.
+        cells: the cells to check.
+        folder: folder of all results.
+        configurations: configuration hash -> file, for every existing result.
     """
     for cell in cells:
-        path, known = folder / cell.path, configurations.get(cell.configuration_hash)
+        path, existing = folder / cell.path, configurations.get(cell.configuration_hash)
         if path.exists() and read_result(path).origin.configuration == cell.configuration_hash:
             continue
-        if known is None:
+        if existing is None:
             if path.exists():
-                logger.info("%s is of another configuration and is run again", path)
+                logger.info("%s has another configuration and is run again", path)
             yield cell
         else:
-            logger.info("%s is the run of %s", path, known)
-            write_result(path, read_result(known))
+            logger.info("%s is copied from %s, which has the same configuration", path, existing)
+            write_result(path, read_result(existing))
 
 
-def finished(folder: Path, scale: str) -> dict[str, Path]:
-    """Return configuration hash -> file of the results of a scale."""
+def finished_results(folder: Path, scale: str) -> dict[str, Path]:
+    """Return configuration hash -> result file, for all results of a scale."""
     return {read_result(path).origin.configuration: path for path in sorted(folder.glob(f"*/{scale}/*/*/*/*.csv"))}
 
 
-def _shown(value: float | str) -> str:
+def _text(value: float | str) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _fields(kind: Any, texts: dict[str, str]) -> dict[str, Any]:
-    """Return the values of a dataclass's fields, each of the type that it states."""
+def _parsed(dataclass_type: Any, texts: dict[str, str]) -> dict[str, Any]:
+    """Return the values of a dataclass's fields, converted to the fields' types."""
     types = {"int": int, "float": float, "str": str}
-    return {entry.name: types[str(entry.type)](texts[entry.name]) for entry in fields(kind)}
+    return {item.name: types[str(item.type)](texts[item.name]) for item in fields(dataclass_type)}

@@ -1,4 +1,4 @@
-"""How large the runs of an experiment are. Scales are never mixed in one table."""
+"""Scales: sizes of an experiment's runs. One table never mixes scales."""
 
 from __future__ import annotations
 
@@ -8,49 +8,49 @@ from typing import Any, Literal
 
 @dataclass(frozen=True)
 class Scale:
-    """What every run of a table has in common."""
+    """Sizes and settings that all runs of a table share."""
 
     name: str
-    """Its folder among the results."""
+    """Name of its result folder."""
     width: int
-    """Fields n of the network."""
+    """Width n of the network: regular fields per layer."""
     crop_size: int
-    """Pixels the network sees."""
+    """Rows and columns of the crop that the network takes, pixels."""
     steps: int
     """Training steps of behaviour cloning."""
     batch_size: int
-    """Frames or transitions per step."""
+    """Frames or transitions per training step."""
     eval_every: int
-    """Steps between evaluations."""
+    """Training steps of behaviour cloning between evaluations."""
     eval_episodes: int
-    """Episodes of each."""
+    """Episodes per evaluation."""
     rl_steps: int
     """Joint steps of reinforcement learning (five simulators act, one update); twice as many for the harder tasks."""
     rl_eval_every: int
     """Joint steps between evaluations."""
     simulators: int
-    """Scenes that evaluation runs side by side."""
+    """Simulators that evaluate in parallel (behaviour cloning)."""
     seeds: int = 3
-    """Runs of each kind, unless `--seeds` says otherwise."""
+    """Runs per cell of a table, seeds 0, 1, …; `--seeds` overrides it."""
     max_steps: int = 50
-    """Actions per episode of an evaluation."""
+    """Actions per evaluation episode at most."""
     demonstrations: tuple[int, ...] | None = None
-    """In place of the experiment's own numbers of them."""
+    """Numbers of demonstrations that replace the experiment's."""
     weight_averaging: float = 0.0
-    """Decay of the average of the weights that acts in evaluation."""
+    """Decay of the exponential moving average of the weights, which is evaluated; 0 turns it off."""
     learning_rate_decay: Literal["none", "cosine"] = "none"
-    """Of behaviour cloning; `cosine` lowers the rate to zero."""
+    """Learning rate schedule of behaviour cloning; `cosine` decays the rate to zero."""
     dtype: str = "float32"
     """Precision of convolutions."""
 
     @property
     def policy(self) -> dict[str, Any]:
-        """Settings that every policy of the scale has."""
+        """Policy settings that the scale determines."""
         names = ("width", "crop_size", "weight_averaging", "dtype")
         return {name: getattr(self, name) for name in names}
 
     def __str__(self) -> str:
-        return ", ".join(f"{entry.name}={getattr(self, entry.name)}" for entry in fields(self))
+        return ", ".join(f"{setting.name}={getattr(self, setting.name)}" for setting in fields(self))
 
 
 SCALES = {
@@ -100,4 +100,5 @@ SCALES = {
         ),
     )
 }
-"""`paper` is its appendix A.3 in bfloat16, for a GPU; `laptop` is for two cores, `smoke` shows that everything runs."""
+"""Name -> scale. `paper`: the paper's appendix A.3 in bfloat16, for a GPU. `laptop`: two CPU cores. `smoke`: a check
+that everything runs."""

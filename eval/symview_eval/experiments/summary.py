@@ -1,4 +1,4 @@
-"""What the results of several seeds say together, beside the paper's values."""
+"""Success rates over seeds with their intervals, and their differences from the paper's values."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pathlib import Path
 
 from scipy import stats
 
-from symview_eval.experiments.grid import Experiment, Row, select
+from symview_eval.experiments.grid import Experiment, MethodRow, select
 from symview_eval.experiments.results import Checkpoint, Result, read_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.statistics import SuccessRate
 
-LAST = 5  # checkpoints whose mean is told
+LAST_CHECKPOINTS = 5  # checkpoints whose mean is reported
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A success rate over seeds and its 95 % interval, in [0, 1]."""
+    """A success rate over seeds and its 95 % interval, all in [0, 1]."""
 
     mean: float
     low: float
@@ -34,55 +34,56 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A row of a table for one task and number of demonstrations."""
+class TableEntry:
+    """Results of one method, task and number of demonstrations."""
 
-    row: Row
+    row: MethodRow
     task: str
     demonstrations: int
     results: tuple[Result, ...]
-    """Of the seeds."""
+    """One result per seed."""
     best: Estimate
-    """Of the highest rate among a training's checkpoints, as the paper tells it; it is optimistic."""
+    """Rate of each training's best checkpoint, as the paper reports it; this is optimistic."""
     last: Estimate
-    """Of the last checkpoint."""
+    """Rate of the last checkpoint."""
     last_five: Estimate
-    """Of the mean over the last five checkpoints."""
+    """Mean rate of the last five checkpoints."""
     paper: float
-    """Rate that the paper prints, nan if it prints none."""
+    """The paper's rate in [0, 1]; nan if it prints none."""
 
     @property
     def episodes(self) -> int:
-        """Of the last five checkpoints of all seeds."""
-        return sum(point.episodes for result in self.results for point in result.checkpoints[-LAST:])
+        """Number of episodes in the last five checkpoints of all seeds."""
+        return sum(point.episodes for result in self.results for point in result.checkpoints[-LAST_CHECKPOINTS:])
 
     @property
     def difference(self) -> float:
-        """`best` less the paper's."""
+        """Mean of `best` minus the paper's rate."""
         return self.best.mean - self.paper
 
 
 @dataclass(frozen=True)
-class Ordering:
-    """Two rows of a table, and how they are ordered."""
+class MethodPair:
+    """Two methods on one task and number of demonstrations, which the paper puts in an order."""
 
-    better: Entry
-    """By the paper."""
-    worse: Entry
+    better: TableEntry
+    """The method with the higher rate in the paper."""
+    worse: TableEntry
+    """The method with the lower rate in the paper."""
 
     @property
-    def found(self) -> float:
-        """By how much the better one is better here; below zero where it is worse."""
+    def measured_difference(self) -> float:
+        """Measured rate of `better` minus that of `worse`, best checkpoints; negative where the order is reversed."""
         return self.better.best.mean - self.worse.best.mean
 
     @property
-    def stated(self) -> float:
-        """The same in the paper."""
+    def paper_difference(self) -> float:
+        """The paper's rate of `better` minus that of `worse`."""
         return self.better.paper - self.worse.paper
 
 
-def entries(experiment: Experiment, scale: str, folder: Path) -> list[Entry]:
-    """Return what is known of an experiment at a scale, rows of one task and number of demonstrations together."""
+def table_entries(experiment: Experiment, scale: str, folder: Path) -> list[TableEntry]:
+    """Return the entries of an experiment at a scale, sorted by task, number of demonstrations and row."""
     paper = paper_values(experiment.name)
     groups: dict[tuple[str, int, str], list[Result]] = {}
     rows = {row.name: row for row in experiment.rows}
@@ -90,26 +91,26 @@ def entries(experiment: Experiment, scale: str, folder: Path) -> list[Entry]:
         task, row, demonstrations = path.parts[-4:-1]
         if row in rows and task in experiment.tasks:
             groups.setdefault((task, int(demonstrations), row), []).append(read_result(path))
-    order = {row: index for index, row in enumerate(rows)}
-    tasks = {task: index for index, task in enumerate(experiment.tasks)}
+    row_order = {row: index for index, row in enumerate(rows)}
+    task_order = {task: index for index, task in enumerate(experiment.tasks)}
     return [
         _entry(rows[row], task, demonstrations, tuple(groups[task, demonstrations, row]), paper)
-        for task, demonstrations, row in sorted(groups, key=lambda key: (tasks[key[0]], key[1], order[key[2]]))
+        for task, demonstrations, row in sorted(groups, key=lambda key: (task_order[key[0]], key[1], row_order[key[2]]))
     ]
 
 
-def orderings(found: Sequence[Entry]) -> list[Ordering]:
-    """Return every two rows of one task and number of demonstrations that the paper puts in an order."""
+def method_pairs(entries: Sequence[TableEntry]) -> list[MethodPair]:
+    """Return all pairs of entries of one task and number of demonstrations whose rates differ in the paper."""
     pairs = []
-    for one, other in combinations(found, 2):
-        comparable = (one.task, one.demonstrations) == (other.task, other.demonstrations)
-        if comparable and one.paper != other.paper and not math.isnan(one.paper + other.paper):
-            pairs.append(Ordering(one, other) if one.paper > other.paper else Ordering(other, one))
+    for first, second in combinations(entries, 2):
+        is_comparable = (first.task, first.demonstrations) == (second.task, second.demonstrations)
+        if is_comparable and first.paper != second.paper and not math.isnan(first.paper + second.paper):
+            pairs.append(MethodPair(first, second) if first.paper > second.paper else MethodPair(second, first))
     return pairs
 
 
 def paper_values(experiment: str) -> dict[tuple[str, int, str], float]:
-    """Return (task, demonstrations, row) -> the success rate that the paper prints; figures have none."""
+    """Return (task, demonstrations, row name) -> the paper's success rate in [0, 1]; empty for figures."""
     file = resources.files("symview_eval.experiments") / "paper" / f"{experiment}.csv"
     if not file.is_file():
         return {}
@@ -120,29 +121,33 @@ def paper_values(experiment: str) -> dict[tuple[str, int, str], float]:
 
 
 def _entry(
-    row: Row, task: str, demonstrations: int, results: tuple[Result, ...], paper: dict[tuple[str, int, str], float]
-) -> Entry:
-    return Entry(
+    row: MethodRow,
+    task: str,
+    demonstrations: int,
+    results: tuple[Result, ...],
+    paper: dict[tuple[str, int, str], float],
+) -> TableEntry:
+    return TableEntry(
         row,
         task,
         demonstrations,
         results,
         _pooled([[max(result.checkpoints, key=lambda point: point.rate)] for result in results]),
         _pooled([result.checkpoints[-1:] for result in results]),
-        _pooled([result.checkpoints[-LAST:] for result in results]),
+        _pooled([result.checkpoints[-LAST_CHECKPOINTS:] for result in results]),
         paper.get((task, demonstrations, row.name), math.nan),
     )
 
 
 def _pooled(seeds: Sequence[Sequence[Checkpoint]]) -> Estimate:
-    """Return the rate over all episodes of each seed's checkpoints.
+    """Return the mean over seeds of the success rate of each seed's checkpoints.
 
-    The interval is the wider of two: Student's over seeds, which vary as trainings do, and Wilson's over episodes,
-    which does not vanish where the seeds happen to agree.
+    The interval covers two intervals: Student's t over seeds, for the variance between trainings, and Wilson's over
+    episodes, which stays positive where all seeds have the same rate.
     """
-    rates = [sum(one.successes for one in points) / sum(one.episodes for one in points) for points in seeds]
-    every = [one for points in seeds for one in points]
-    low, high = SuccessRate(sum(one.successes for one in every), sum(one.episodes for one in every)).interval
+    counts = [(sum(point.successes for point in points), sum(point.episodes for point in points)) for points in seeds]
+    rates = [successes / episodes for successes, episodes in counts]
+    low, high = SuccessRate(*map(sum, zip(*counts, strict=True))).interval
     mean = statistics.fmean(rates)
     if len(rates) > 1:
         half = float(stats.t.ppf(0.975, len(rates) - 1)) * statistics.stdev(rates) / math.sqrt(len(rates))
@@ -150,14 +155,14 @@ def _pooled(seeds: Sequence[Sequence[Checkpoint]]) -> Estimate:
     return Estimate(mean, low, high)
 
 
-def measured_scales(experiment: Experiment, folder: Path) -> list[str]:
-    """Return the scales there are results of, the largest first."""
+def scales_with_results(experiment: Experiment, folder: Path) -> list[str]:
+    """Return the scales that have results, largest first."""
     return [scale for scale in SCALES if any((folder / experiment.name / scale).glob("*/*/*/*.csv"))]
 
 
-def is_current(entry: Entry, experiment: Experiment, scale: str) -> bool:
-    """Whether all of an entry's results are of what the experiment is now."""
+def is_current(entry: TableEntry, experiment: Experiment, scale: str) -> bool:
+    """Whether all of an entry's results have the experiment's present configuration."""
     seeds = [result.origin.seed for result in entry.results]
     cells = select(experiment, SCALES[scale], [entry.task], [entry.row.name], [entry.demonstrations], seeds)
-    known = {cell.configuration_hash for cell in cells}
-    return all(result.origin.configuration in known for result in entry.results)
+    hashes = {cell.configuration_hash for cell in cells}
+    return all(result.origin.configuration in hashes for result in entry.results)

@@ -13,14 +13,14 @@ def cells(name, scale=LAPTOP, **chosen):
     return select(EXPERIMENTS[name], scale, **chosen)
 
 
-def only(name, task, method, demonstrations=10):
+def single_cell(name, task, method, demonstrations=10):
     (cell,) = cells(name, tasks=[task], methods=[method], demos=[demonstrations], seeds=[0])
     return cell
 
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=SCALES)
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_row_is_a_policy(name, scale):
+def test_every_row_configures_a_policy(name, scale):
     for row in EXPERIMENTS[name].rows:
         cell = cells(name, scale, methods=[row.name])[0]
         if cell.algorithm == "sacfd":
@@ -36,20 +36,20 @@ def test_every_row_is_a_policy(name, scale):
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_names_of_results_are_unique(name):
+def test_result_paths_are_unique(name):
     chosen = cells(name)
     assert len({cell.path for cell in chosen}) == len(chosen)
 
 
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if paper_values(name)])
-def test_the_papers_values_are_those_of_the_table(name):
-    stated = set(paper_values(name))
-    computed = {(cell.task, cell.demonstrations, cell.row.name) for cell in cells(name, seeds=[0])}
+def test_every_row_has_a_paper_value(name):
+    in_paper = set(paper_values(name))
+    in_table = {(cell.task, cell.demonstrations, cell.row.name) for cell in cells(name, seeds=[0])}
     missing = {("block_stacking", 50, "voxel_equi")} if name == "table1" else set()  # the paper prints a dash
-    assert stated == computed - missing
+    assert in_paper == in_table - missing
 
 
-def test_values_of_the_paper_are_as_printed():
+def test_paper_values():
     assert paper_values("table1")["block_picking", 10, "reproj_equi"] == pytest.approx(0.847)
     assert paper_values("table1")["block_in_bowl", 50, "sideview_nonequi"] == pytest.approx(0.45)
     assert paper_values("table2")["block_stacking", 50, "persp_equi"] == pytest.approx(0.567)
@@ -59,22 +59,22 @@ def test_values_of_the_paper_are_as_printed():
     assert not paper_values("figure7")
 
 
-def test_a_run_that_is_in_two_tables_is_one():
-    one = only("table1", "block_stacking", "reproj_equi").configuration_hash
-    assert one == only("table3", "block_stacking", "reproj_equi").configuration_hash
-    assert one == only("table4", "block_stacking", "reproj_equi").configuration_hash
-    assert one == only("figure7", "block_stacking", "reproj_equi_45deg").configuration_hash
-    assert one != only("figure7", "block_stacking", "reproj_equi_30deg").configuration_hash
-    assert one != only("table4", "block_stacking", "reproj_equi_local").configuration_hash
+def test_equal_cells_of_two_tables_share_a_configuration():
+    shared = single_cell("table1", "block_stacking", "reproj_equi").configuration_hash
+    assert shared == single_cell("table3", "block_stacking", "reproj_equi").configuration_hash
+    assert shared == single_cell("table4", "block_stacking", "reproj_equi").configuration_hash
+    assert shared == single_cell("figure7", "block_stacking", "reproj_equi_45deg").configuration_hash
+    assert shared != single_cell("figure7", "block_stacking", "reproj_equi_30deg").configuration_hash
+    assert shared != single_cell("table4", "block_stacking", "reproj_equi_local").configuration_hash
 
 
-def test_methods_learn_from_the_same_demonstrations():
+def test_methods_share_demonstrations():
     chosen = cells("table1", tasks=["block_picking"], demos=[10], seeds=[0])
     assert len(chosen) == 6
     assert len({cell.recording for cell in chosen}) == 1
 
 
-def test_reinforcement_learning_has_the_papers_demonstrations_and_steps():
+def test_rl_uses_the_papers_demonstrations_and_steps():
     paper = {cell.task: cell for cell in cells("figure5", SCALES["paper"], seeds=[0])}
     assert {task: (cell.demonstrations, cell.steps) for task, cell in paper.items()} == {
         "block_picking": (20, 5000),
@@ -93,6 +93,6 @@ def test_reinforcement_learning_has_the_papers_demonstrations_and_steps():
         ({"methods": ["persp_equi"]}, "--methods entry 'persp_equi'"),
     ],
 )
-def test_what_the_experiment_lacks_is_refused(chosen, message):
+def test_an_unknown_task_or_method_is_refused(chosen, message):
     with pytest.raises(ValueError, match=message):
         cells("table1", **chosen)

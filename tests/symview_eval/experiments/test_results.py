@@ -8,9 +8,9 @@ from symview_eval.experiments.results import (
     Origin,
     Result,
     Times,
-    finished,
+    finished_results,
     read_result,
-    unfinished,
+    unfinished_cells,
     write_result,
 )
 from symview_eval.experiments.scale import SCALES
@@ -29,7 +29,7 @@ def cells(name):
     return select(EXPERIMENTS[name], SCALE, ["block_stacking"], ["reproj_equi"], [10], [0])
 
 
-def test_a_result_survives_its_file(tmp_path):
+def test_a_result_file_round_trip(tmp_path):
     path = tmp_path / "table1" / "0.csv"
     write_result(path, result())
     read = read_result(path)
@@ -40,7 +40,7 @@ def test_a_result_survives_its_file(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "step,successes\n1,2\n", "# configuration: a\nstep\nx\n"])
-def test_another_file_is_refused(text, tmp_path):
+def test_a_file_without_results_is_refused(text, tmp_path):
     (tmp_path / "0.csv").write_text(text)
     with pytest.raises(ValueError, match=r"0.csv is not a result of symview-experiment"):
         read_result(tmp_path / "0.csv")
@@ -48,19 +48,19 @@ def test_another_file_is_refused(text, tmp_path):
 
 def test_a_finished_cell_is_not_run_again(tmp_path):
     (cell,) = cells("table1")
-    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == [cell]
+    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == [cell]
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
-    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == []
+    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == []
 
 
-def test_a_result_of_other_settings_is_run_again(tmp_path):
+def test_a_cell_with_other_settings_is_run_again(tmp_path):
     (cell,) = cells("table1")
     write_result(tmp_path / cell.path, result("another"))
-    assert list(unfinished([cell], tmp_path, finished(tmp_path, SCALE.name))) == [cell]
+    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == [cell]
 
 
-def test_the_result_of_another_table_is_taken_over(tmp_path):
-    (cell,), (same,) = cells("table1"), cells("table4")
+def test_a_result_of_another_table_is_copied(tmp_path):
+    (cell,), (equal_cell,) = cells("table1"), cells("table4")
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
-    assert list(unfinished([same], tmp_path, finished(tmp_path, SCALE.name))) == []
-    assert read_result(tmp_path / same.path).checkpoints == result().checkpoints
+    assert list(unfinished_cells([equal_cell], tmp_path, finished_results(tmp_path, SCALE.name))) == []
+    assert read_result(tmp_path / equal_cell.path).checkpoints == result().checkpoints

@@ -4,7 +4,7 @@ from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.plots import plot
 from symview_eval.experiments.results import write_result
 from symview_eval.experiments.scale import SCALES
-from symview_eval.experiments.summary import entries, is_current, measured_scales, orderings
+from symview_eval.experiments.summary import is_current, method_pairs, scales_with_results, table_entries
 
 from .test_results import result
 
@@ -12,7 +12,7 @@ TABLE, SCALE = EXPERIMENTS["table1"], SCALES["laptop"]
 
 
 def write(folder, method, *seeds):
-    """A result of 10 demonstrations of block picking for every seed, each a list of successes of 20 episodes."""
+    """Write results for block picking with 10 demonstrations; each seed is a list of successes of 20 episodes."""
     for seed, successes in enumerate(seeds):
         (cell,) = select(TABLE, SCALE, ["block_picking"], [method], [10], [seed])
         write_result(folder / cell.path, result(cell.configuration_hash, successes, seed))
@@ -20,7 +20,7 @@ def write(folder, method, *seeds):
 
 def test_best_last_and_mean_of_the_last_five(tmp_path):
     write(tmp_path, "reproj_equi", [20, 2, 4, 6, 8, 10], [0, 2, 4, 16, 8, 10])
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     assert entry.best.mean == pytest.approx((1.0 + 0.8) / 2)
     assert entry.last.mean == pytest.approx(0.5)
     assert entry.last_five.mean == pytest.approx((30 / 100 + 40 / 100) / 2)
@@ -29,63 +29,63 @@ def test_best_last_and_mean_of_the_last_five(tmp_path):
     assert entry.difference == pytest.approx(0.9 - 0.847)
 
 
-def test_intervals_over_seeds_and_episodes(tmp_path):
+def test_the_interval_over_seeds(tmp_path):
     write(tmp_path, "reproj_equi", [10], [12], [14])
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     half = 4.30265 * 0.1 / 3**0.5  # Student's, two degrees of freedom, standard deviation 0.1
     for estimate in (entry.best, entry.last, entry.last_five):
         assert (estimate.low, estimate.high) == pytest.approx((0.6 - half, 0.6 + half), abs=1e-4)
 
 
-def test_seeds_that_agree_do_not_make_a_rate_certain(tmp_path):
+def test_the_interval_of_equal_seeds_is_that_of_their_episodes(tmp_path):
     write(tmp_path, "reproj_equi", [10], [10], [10])
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     for estimate in (entry.best, entry.last, entry.last_five):
         assert (estimate.low, estimate.high) == pytest.approx((0.3774, 0.6226), abs=1e-3)  # Wilson, 30 of 60
 
 
-def test_of_one_seed_only_its_episodes_speak(tmp_path):
+def test_the_interval_of_one_seed_is_that_of_its_episodes(tmp_path):
     write(tmp_path, "reproj_equi", [10, 4])
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     assert str(entry.best) == "50.0 (30 to 70)"
     assert str(entry.last) == "20.0 (8 to 42)"
 
 
-def test_orders_of_the_paper_are_compared(tmp_path):
-    write(tmp_path, "oracle_equi", [19])  # the paper: 77.8
+def test_pairs_have_the_papers_order(tmp_path):
+    write(tmp_path, "oracle_equi", [19])  # paper: 77.8
     write(tmp_path, "reproj_equi", [18])  # 84.7
     write(tmp_path, "sideview_nonequi", [4])  # 56.2
-    pairs = orderings(entries(TABLE, "laptop", tmp_path))
-    assert {(pair.better.row.name, pair.worse.row.name, pair.found > 0) for pair in pairs} == {
+    pairs = method_pairs(table_entries(TABLE, "laptop", tmp_path))
+    assert {(pair.better.row.name, pair.worse.row.name, pair.measured_difference > 0) for pair in pairs} == {
         ("reproj_equi", "oracle_equi", False),
         ("reproj_equi", "sideview_nonequi", True),
         ("oracle_equi", "sideview_nonequi", True),
     }
 
 
-def test_a_seed_may_be_missing(tmp_path):
+def test_a_missing_seed_is_ignored(tmp_path):
     (cell,) = select(TABLE, SCALE, ["block_picking"], ["reproj_equi"], [10], [1])
     write_result(tmp_path / cell.path, result(cell.configuration_hash, seed=1))
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     assert is_current(entry, TABLE, "laptop")
 
 
-def test_curves_end_where_the_shortest_seed_does(tmp_path):
+def test_learning_curves_end_with_the_shortest_seed(tmp_path):
     figure5 = EXPERIMENTS["figure5"]
     for seed, successes in enumerate([[1, 2, 3], [1, 2]]):
         (cell,) = select(figure5, SCALE, ["block_picking"], ["reproj_equi"], (), [seed])
         write_result(tmp_path / cell.path, result(cell.configuration_hash, successes, seed))
-    figure = plot(figure5, "laptop", entries(figure5, "laptop", tmp_path))
+    figure = plot(figure5, "laptop", table_entries(figure5, "laptop", tmp_path))
     assert list(figure.axes[0].lines[0].get_xdata()) == [200, 400]
     assert "scale laptop" in figure.get_suptitle()
 
 
-def test_results_of_other_settings_are_told_apart(tmp_path):
+def test_results_with_other_settings_are_not_current(tmp_path):
     write(tmp_path, "reproj_equi", [10])
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     assert is_current(entry, TABLE, "laptop")
     (cell,) = select(TABLE, SCALE, ["block_picking"], ["reproj_equi"], [10], [0])
     write_result(tmp_path / cell.path, result("another"))
-    (entry,) = entries(TABLE, "laptop", tmp_path)
+    (entry,) = table_entries(TABLE, "laptop", tmp_path)
     assert not is_current(entry, TABLE, "laptop")
-    assert measured_scales(TABLE, tmp_path) == ["laptop"]
+    assert scales_with_results(TABLE, tmp_path) == ["laptop"]

@@ -5,21 +5,21 @@ import torch
 
 from lerobot_policy_symview.nn.encoders.convolutional import ConvolutionalEncoder
 from lerobot_policy_symview.nn.escnn_bridge import EscnnEncoder
-from symview_eval.benchmarks import benchmark
+from symview_eval.benchmarks import cli, experts
 from symview_eval.benchmarks import policy as policy_benchmark
 from symview_eval.benchmarks import rl as rl_benchmark
 from symview_eval.benchmarks import views as views_benchmark
 
 
-def test_experts_are_counted_per_task():
-    results = benchmark.benchmark_experts(benchmark.ExpertsBenchmark(seeds=2, tasks=["block_picking"]))
+def test_the_experts_benchmark_reports_every_task():
+    results = experts.benchmark_experts(experts.ExpertsBenchmark(seeds=2, tasks=["block_picking"]))
     assert results == {"block_picking": {"success": 1.0, "mean_length": 7.0, "min_length": 7, "max_length": 7}}
 
 
-def test_the_environment_benchmark_names_every_cost(monkeypatch, capsys):
+def test_the_env_benchmark_names_every_time(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["symview-benchmark", "env", "--episodes=1", "--json"])
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out)
     assert list(results) == [
@@ -36,10 +36,10 @@ def test_the_environment_benchmark_names_every_cost(monkeypatch, capsys):
     assert all(value > 0 for value in results.values())
 
 
-def test_an_unknown_suite_is_answered_with_the_nearest_known_one(monkeypatch, capsys):
+def test_an_unknown_suite_gets_a_suggestion(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["symview-benchmark", "expert"])
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 2
     assert "did you mean 'experts'" in capsys.readouterr().err
 
@@ -48,20 +48,20 @@ def test_the_views_benchmark_names_every_ratio(monkeypatch, capsys):
     monkeypatch.setattr(views_benchmark, "RECORDED", 2)
     monkeypatch.setattr("sys.argv", ["symview-benchmark", "views", "--repeats=2", "--frames=20", "--json"])
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out.splitlines()[-1])
-    stated = {"offline_codec_share", "offline_two_process_speedup", "frames_per_s", "floor_ratio", "warp_us"}
-    assert stated | {f"{name}_ratio" for name in views_benchmark.VIEWS} <= set(results)
+    expected = {"offline_codec_share", "offline_two_process_speedup", "frames_per_s", "floor_ratio", "warp_us"}
+    assert expected | {f"{name}_ratio" for name in views_benchmark.VIEWS} <= set(results)
     assert results["offline_codec_share"] < 1
     assert all(value > 0 for value in results.values())
 
 
-def test_the_experiment_benchmark_says_where_time_goes(monkeypatch, capsys):
+def test_the_experiment_benchmark_names_every_share(monkeypatch, capsys):
     arguments = ["--scale=smoke", "--method=sideview_nonequi", "--num_workers=1", "--json"]
     monkeypatch.setattr("sys.argv", ["symview-benchmark", "experiment", *arguments])
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert 0 < results["useful_core_share"] <= 1
@@ -76,10 +76,10 @@ def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
         ["symview-benchmark", "policy", "--batch_size=2", "--width=16", "--crop_size=64", "--repeats=1", "--json"],
     )
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out.splitlines()[-1])
-    stated = {
+    expected = {
         "train_step_ratio_escnn_fp32",
         "train_step_ratio_plain",
         "train_step_floor_s",
@@ -91,16 +91,16 @@ def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
         "construct_s",
         "loader_share",
     }
-    assert stated <= set(results)
+    assert expected <= set(results)
     assert all(value > 0 for value in results.values())
 
 
-def test_the_reinforcement_learning_benchmark_names_every_cost(monkeypatch, capsys):
+def test_the_rl_benchmark_names_every_time(monkeypatch, capsys):
     monkeypatch.setattr(rl_benchmark, "DEMONSTRATIONS", 1)
     argv = ["symview-benchmark", "rl", "--batch_size=4", "--num_simulators=2", "--rounds=1", "--json"]
     monkeypatch.setattr("sys.argv", [*argv, "--policy.width=16", "--policy.crop_size=64"])
     with pytest.raises(SystemExit) as end:
-        benchmark.main()
+        cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert {"joint_step_ratio", "sample_ms", "sample_floor_ms", "joint_step_s", "network_s", "simulation_s"} <= set(
@@ -111,16 +111,16 @@ def test_the_reinforcement_learning_benchmark_names_every_cost(monkeypatch, caps
     assert results["network_share"] + results["waiting_share"] < 1
 
 
-def test_the_network_it_is_compared_with_computes_the_same():
+def test_the_plain_network_computes_the_same_features():
     config = policy_benchmark.PolicyBenchmark(width=16, crop_size=64)
     policy = policy_benchmark._policy(config)
-    seen = policy_benchmark._input(config, policy, 3)
+    inputs = policy_benchmark._input(config, policy, 3)
     plain = policy_benchmark.PlainNetwork(policy.network.encoder)
-    torch.testing.assert_close(plain(*seen), policy.network.encoder(*seen).flatten(1), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(plain(*inputs), policy.network.encoder(*inputs).flatten(1), rtol=1e-4, atol=1e-4)
 
 
-def test_policies_are_measured_in_bfloat16(monkeypatch):
-    """escnn's network is left in float32; what does not depend on the precision is not measured here."""
+def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
+    """escnn's network stays in float32. Parts that do not depend on the precision are replaced."""
     monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
     monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
@@ -128,12 +128,12 @@ def test_policies_are_measured_in_bfloat16(monkeypatch):
     for kind in (policy_benchmark.PlainNetwork, ConvolutionalEncoder, EscnnEncoder):
         forward = kind.forward
 
-        def noted(self, *seen, kind=kind, forward=forward):
-            result = forward(self, *seen)
+        def recorded(self, *inputs, kind=kind, forward=forward):
+            result = forward(self, *inputs)
             computed.setdefault(kind.__name__, set()).add(result.dtype)
             return result
 
-        monkeypatch.setattr(kind, "forward", noted)
+        monkeypatch.setattr(kind, "forward", recorded)
     config = policy_benchmark.PolicyBenchmark(batch_size=2, width=16, crop_size=64, repeats=1, dtype="bfloat16")
     assert all(value > 0 for value in policy_benchmark.benchmark_policy(config).values())
     assert computed == {
@@ -144,12 +144,12 @@ def test_policies_are_measured_in_bfloat16(monkeypatch):
 
 
 @pytest.mark.parametrize(("option", "value"), [("dtype", "float16"), ("device", "cuda:99"), ("device", "abacus")])
-def test_a_precision_or_device_that_is_not_there_is_refused(option, value):
+def test_an_unavailable_precision_or_device_is_refused(option, value):
     with pytest.raises(ValueError, match=f"--{option}.*{value}"):
         policy_benchmark.PolicyBenchmark(**{option: value})
 
 
-def test_batches_are_measured_on_any_device():
+def test_batched_ratios_on_the_cpu():
     results = views_benchmark.batched_ratios(views_benchmark._frame(), 2, "cpu")
     assert len(results) == 6
     assert all(value > 0 for value in results.values())

@@ -1,4 +1,4 @@
-"""Paths that a dataset states stay in it."""
+"""Paths in a dataset's metadata must stay inside its folder."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_symview.errors import SymviewError
 from lerobot_symview.runtime.cli import DatasetLocation
-from tests.hostile.files import (
+from tests.malicious.files import (
     DATA,
     EPISODES,
     RGB,
@@ -38,23 +38,23 @@ TEMPLATES = [
 
 @both_commands
 @pytest.mark.parametrize("template", TEMPLATES)
-def test_tables_are_in_the_dataset(dataset, outside, tmp_path, command, template):
-    stated = template.replace("PRIVATE", str(outside)) if isinstance(template, str) else template
-    change_info(dataset, data_path=stated)
+def test_tables_must_be_inside_the_dataset(dataset, outside, tmp_path, command, template):
+    data_path = template.replace("PRIVATE", str(outside)) if isinstance(template, str) else template
+    change_info(dataset, data_path=data_path)
     with pytest.raises(SymviewError, match="data_path"):
         command(dataset, tmp_path)
 
 
 @both_commands
 @pytest.mark.parametrize("template", [*TEMPLATES[:-3], "videos/{video_key.__class__}/{video_key}.mp4"])
-def test_videos_are_in_the_dataset(dataset, outside, tmp_path, command, template):
+def test_videos_must_be_inside_the_dataset(dataset, outside, tmp_path, command, template):
     make_video_feature(dataset, template.replace("PRIVATE", str(outside)))
     with pytest.raises(SymviewError, match="video_path"):
         command(dataset, tmp_path)
 
 
-def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, tmp_path):
-    """With these numbers it is 77/77 in the source, and in the result, whose files are numbered from 0, ../.. ."""
+def test_a_template_must_not_lead_outside_the_derived_dataset(dataset, tmp_path):
+    """The template gives 77/77 in the source, and ../.. in the derived dataset, whose files are numbered from 0."""
     folder = "{file_index!s:.>2.{chunk_index}s}"
     change_info(dataset, data_path=f"{folder}/{folder}/stray{{file_index}}.parquet")
     change_columns(dataset / EPISODES, **{"data/chunk_index": 2, "data/file_index": 77})
@@ -66,18 +66,18 @@ def test_nothing_is_written_where_a_template_leads_only_in_the_result(dataset, t
 
 
 @both_commands
-@pytest.mark.parametrize("place", ["../../private/chunk-000", -1, 0.5, None])
-def test_the_places_of_tables_are_numbers(dataset, outside, tmp_path, command, place):
+@pytest.mark.parametrize("chunk_index", ["../../private/chunk-000", -1, 0.5, None])
+def test_chunk_indices_must_be_counts(dataset, outside, tmp_path, command, chunk_index):
     change_info(dataset, data_path="data/{chunk_index}/file-{file_index:03d}.parquet")
-    change_columns(dataset / EPISODES, **{"data/chunk_index": place})
+    change_columns(dataset / EPISODES, **{"data/chunk_index": chunk_index})
     with pytest.raises(SymviewError, match="chunk_index"):
         command(dataset, tmp_path)
 
 
 @both_commands
-@pytest.mark.parametrize("name", ["../../../strangers/private", "../../private", "PRIVATE", "..", "", "a/b", "a\0b"])
-def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, name):
-    """The videos of a feature are copied from the folder of its name to the folder of its name."""
+@pytest.mark.parametrize("name", ["../../../download/private", "../../private", "PRIVATE", "..", "", "a/b", "a\0b"])
+def test_feature_names_must_not_be_paths(dataset, outside, tmp_path, command, name):
+    """A feature's videos are copied from and to a folder with the feature's name."""
     (dataset / "videos").mkdir()
     video = {"dtype": "video", "shape": [8, 8, 3], "names": ["height", "width", "channels"], "info": {}}
     change_feature(dataset, name.replace("PRIVATE", str(outside)), **video)
@@ -87,16 +87,16 @@ def test_names_of_features_are_no_paths(dataset, outside, tmp_path, command, nam
 
 
 @both_commands
-def test_an_image_in_a_file_elsewhere_is_not_read(dataset, tmp_path, command):
-    """Hugging Face's `datasets` would open what the table names in place of an image, and download it."""
+def test_an_image_in_another_file_is_not_read(dataset, tmp_path, command):
+    """Hugging Face's `datasets` would open, or download, the path that the table gives instead of an image."""
     (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
     change_image(dataset, RGB, None, tmp_path / "secret.png")
     with pytest.raises(ValueError, match="image"):
         command(dataset, tmp_path)
 
 
-def test_an_image_in_a_file_elsewhere_is_not_demonstrated(dataset, tmp_path):
+def test_an_image_in_another_file_is_not_used_for_training(dataset, tmp_path):
     (tmp_path / "secret.png").write_bytes(encoded(".png", np.full((152, 152, 3), 77, np.uint8)))
     change_image(dataset, RGB, None, tmp_path / "secret.png")
     with pytest.raises(SymviewError, match=RGB):
-        open_dataset(DatasetLocation("test/hostile", dataset))
+        open_dataset(DatasetLocation("test/malicious", dataset))

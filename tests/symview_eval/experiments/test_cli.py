@@ -1,4 +1,4 @@
-"""The command, whole, at the scale `smoke`."""
+"""`symview-experiment` end to end, at the scale `smoke`."""
 
 import csv
 import dataclasses
@@ -15,13 +15,13 @@ from lerobot.scripts import lerobot_eval
 from lerobot_policy_symview.rl.checkpoints import describe
 from lerobot_symview.runtime.cli import CommandError
 from symview_eval.experiments import cells as cells_module
-from symview_eval.experiments import experiment
-from symview_eval.experiments.experiment import ExperimentConfig, run_experiment
+from symview_eval.experiments import cli
+from symview_eval.experiments.cli import ExperimentConfig, run_experiment
 from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
 from symview_eval.experiments.scale import SCALES
-from symview_eval.experiments.summary import entries
+from symview_eval.experiments.summary import table_entries
 
 pytestmark = pytest.mark.long
 
@@ -33,7 +33,7 @@ def config(folder, **chosen):
 
 @pytest.fixture(scope="module")
 def table1(tmp_path_factory):
-    """Folder in which the whole of table 1 was run."""
+    """Folder with the results and policies of all of table 1."""
     folder = tmp_path_factory.mktemp("table1")
     run_experiment("table1", config(folder, num_workers=2))
     return folder
@@ -41,7 +41,7 @@ def table1(tmp_path_factory):
 
 @pytest.fixture
 def copied(table1, tmp_path):
-    """The same, to change."""
+    """A copy of `table1` that the test may change."""
     return shutil.copytree(table1, tmp_path / "table1")
 
 
@@ -58,7 +58,7 @@ def test_every_cell_of_table_1_has_a_result(table1):
         assert result.times.training_s <= result.origin.seconds
 
 
-def test_what_is_finished_is_not_run_again(copied, monkeypatch):
+def test_finished_cells_are_not_run_again(copied, monkeypatch):
     removed = sorted((copied / "results").rglob("*.csv"))[3]
     content = read_result(removed).checkpoints
     removed.unlink()
@@ -67,10 +67,10 @@ def test_what_is_finished_is_not_run_again(copied, monkeypatch):
     monkeypatch.setattr(cells_module, "run_cell", lambda job: ran.append(job.cell) or run_cell(job))
     run_experiment("table1", config(copied))
     assert [copied / "results" / cell.path for cell in ran] == [removed]
-    assert read_result(removed).checkpoints == content  # the same seed, the same run
+    assert read_result(removed).checkpoints == content  # same seed, same run
 
 
-def test_lerobot_evaluates_what_a_cell_leaves(table1, tmp_path, monkeypatch):
+def test_lerobot_eval_loads_the_policy_of_a_cell(table1, tmp_path, monkeypatch):
     policy = table1 / "output/policies/table1/smoke/block_picking/reproj_equi/1/0/pretrained_model"
     arguments = [
         "lerobot-eval",
@@ -87,7 +87,7 @@ def test_lerobot_evaluates_what_a_cell_leaves(table1, tmp_path, monkeypatch):
     assert json.loads((tmp_path / "eval_info.json").read_text())["overall"]["n_episodes"] == 1
 
 
-def test_the_report_has_every_row_and_needs_nothing_beside_it(table1, tmp_path):
+def test_the_report_has_every_row_and_embeds_its_images(table1, tmp_path):
     page = report(ReportConfig(table1 / "results", tmp_path)).read_text()
     assert "scale=" not in page
     assert "name=smoke" in page
@@ -110,41 +110,41 @@ def test_every_experiment_runs_and_is_reported(name, tmp_path):
     assert (page.parent / f"{name}_smoke.png").is_file()
 
 
-def test_a_cell_that_fails_does_not_keep_others_from_running(tmp_path, monkeypatch):
-    clone = cells_module.clone
+def test_the_other_cells_run_after_one_fails(tmp_path, monkeypatch):
+    run_cloning = cells_module.run_cloning
 
-    def fail_on_the_side(cell, *arguments):
+    def fail_for_one_method(cell, *arguments):
         if cell.row.name == "sideview_equi":
             raise RuntimeError("out of memory")
-        return clone(cell, *arguments)
+        return run_cloning(cell, *arguments)
 
-    monkeypatch.setattr(cells_module, "clone", fail_on_the_side)
+    monkeypatch.setattr(cells_module, "run_cloning", fail_for_one_method)
     chosen = config(tmp_path, tasks=["block_picking"], methods=["sideview_equi", "sideview_nonequi"])
     with pytest.raises(CommandError, match=r"1 of 2 cells failed.*sideview_equi on block_picking.*out of memory"):
         run_experiment("table1", chosen)
-    (done,) = (tmp_path / "results").rglob("*.csv")
-    assert done.parts[-3] == "sideview_nonequi"
-    with done.open() as stream:
+    (result,) = (tmp_path / "results").rglob("*.csv")
+    assert result.parts[-3] == "sideview_nonequi"
+    with result.open() as stream:
         assert list(csv.DictReader(line for line in stream if not line.startswith("#")))
 
 
-def test_demonstrations_that_cannot_be_made_do_not_keep_others_from_being(tmp_path):
+def test_the_other_cells_run_after_a_recording_fails(tmp_path):
     chosen = config(tmp_path, tasks=["block_pushing", "block_picking"], methods=["sideview_nonequi"])
     (tmp_path / "output" / "recordings" / "block_pushing_45deg_1_seed0").mkdir(parents=True)
     with pytest.raises(CommandError, match=r"1 of 2 cells failed.*sideview_nonequi on block_pushing.*exists"):
         run_experiment("table1", chosen)
-    (done,) = (tmp_path / "results").rglob("*.csv")
-    assert "block_picking" in done.parts
+    (result,) = (tmp_path / "results").rglob("*.csv")
+    assert "block_picking" in result.parts
 
 
-def test_reinforcement_learning_of_other_settings_is_begun_anew(tmp_path, monkeypatch):
+def test_a_changed_rl_cell_starts_from_the_beginning(tmp_path, monkeypatch):
     (cell,) = select(EXPERIMENTS["figure5"], SCALES["smoke"], ["block_picking"], ["sideview_nonequi"])
-    job = cells_module.Job(cell, tmp_path / "results", tmp_path / "output", "cpu")
-    begun = []
+    job = cells_module.CellJob(cell, tmp_path / "results", tmp_path / "output", "cpu")
+    resumed = []
 
     def train(configuration):
-        """Leave what a training does: its flags and an evaluation."""
-        begun.append(configuration.resume)
+        """Write the files that a training writes: its flags and an evaluation."""
+        resumed.append(configuration.resume)
         last = job.output / "checkpoints" / "last" / "pretrained_model"
         last.mkdir(parents=True, exist_ok=True)
         (last / "train_config.json").write_text(json.dumps(describe(configuration)))
@@ -152,9 +152,9 @@ def test_reinforcement_learning_of_other_settings_is_begun_anew(tmp_path, monkey
 
     monkeypatch.setattr(cells_module, "train_rl", train)
     longer = dataclasses.replace(cell, scale=dataclasses.replace(cell.scale, rl_steps=3))
-    for asked in (cell, cell, longer):
-        assert cells_module.run_cell(dataclasses.replace(job, cell=asked)).failure == ""
-    assert begun == [False, True, False]
+    for next_cell in (cell, cell, longer):
+        assert cells_module.run_cell(dataclasses.replace(job, cell=next_cell)).failure == ""
+    assert resumed == [False, True, False]
 
 
 def test_cells_run_on_a_ray_cluster(table1, tmp_path):
@@ -176,42 +176,43 @@ def test_cells_run_on_a_ray_cluster(table1, tmp_path):
         (["table1", "--num_workers=0"], "--num_workers must be at least 1"),
     ],
 )
-def test_wrong_use_is_answered_in_one_line(arguments, message, monkeypatch, capsys):
+def test_wrong_arguments_give_a_one_line_error(arguments, message, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["symview-experiment", *arguments])
     with pytest.raises(SystemExit) as end:
-        experiment.main()
+        cli.main()
     assert end.value.code == 2
-    *told, last = capsys.readouterr().err.splitlines()
+    *before, last = capsys.readouterr().err.splitlines()
     assert message in last
-    assert "Traceback" not in "".join(told)
+    assert "Traceback" not in "".join(before)
 
 
-def test_a_report_of_nothing_says_what_to_do(tmp_path):
+def test_a_report_without_results_names_the_remedy(tmp_path):
     with pytest.raises(CommandError, match="run symview-experiment table1 first"):
         report(ReportConfig(tmp_path))
 
 
-def test_the_committed_results_are_what_the_report_is_made_of(tmp_path):
+def test_the_report_covers_the_committed_results(tmp_path):
     results = Path(__file__).parents[3] / "results"
     page = report(ReportConfig(results, tmp_path)).read_text()
-    assert "made with other settings" not in page
-    table = EXPERIMENTS["table1"]
-    found = entries(table, "laptop", results)
-    assert sum(len(entry.results) for entry in found) == len(list((results / "table1" / "laptop").rglob("*.csv")))
+    assert "computed with other settings" not in page
+    entries = table_entries(EXPERIMENTS["table1"], "laptop", results)
+    assert sum(len(entry.results) for entry in entries) == len(list((results / "table1" / "laptop").rglob("*.csv")))
 
 
-def test_the_numbers_of_the_readme_come_from_the_committed_results():
-    """Cells such as `83 (85), mean 60`, of each experiment in the order of its entries there."""
-    readme = re.sub(r"\s+", " ", Path("README.md").read_text())
-    told = set(re.findall(r"\d+(?: \(\d+\))?, mean \d+", readme))
-    known = set()
-    for one in EXPERIMENTS.values():
-        for entry in entries(one, "laptop", Path("results")):
+def test_success_rates_in_the_documentation_match_the_committed_results():
+    """They are written as `83 (85), mean 60`: best checkpoint, the paper's rate, mean of the last five checkpoints."""
+    root = Path(__file__).parents[3]
+    documented, measured = set(), set()
+    for page in (root / "README.md", *(root / "docs").glob("*.md")):
+        text = re.sub(r"\s+", " ", page.read_text())
+        documented |= set(re.findall(r"\d+(?: \(\d+\))?, mean \d+", text))
+    for experiment in EXPERIMENTS.values():
+        for entry in table_entries(experiment, "laptop", root / "results"):
             paper = "" if math.isnan(entry.paper) else f" ({percent(entry.paper)})"
-            known.add(f"{percent(entry.best.mean)}{paper}, mean {percent(entry.last_five.mean)}")
-    assert len(told) > 20
-    assert told <= known
+            measured.add(f"{percent(entry.best.mean)}{paper}, mean {percent(entry.last_five.mean)}")
+    assert len(documented) > 20
+    assert documented <= measured
 
 
 def percent(rate):
-    return math.floor(100 * rate + 0.5 + 1e-9)  # halves upwards, as in the README
+    return math.floor(100 * rate + 0.5 + 1e-9)  # rounds halves up, as the documentation does

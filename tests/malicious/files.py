@@ -1,4 +1,4 @@
-"""Harmless datasets and policies, changed as somebody would who means harm."""
+"""Helpers that turn valid datasets and policies into malicious or malformed ones."""
 
 import json
 import struct
@@ -27,12 +27,12 @@ def derive(dataset, folder):
     return add_views(views_config(dataset, folder / "results" / "inner" / "views", views=["reproj"], size=32))
 
 
-def look(dataset, folder):
-    target = DatasetLocation("test/hostile", dataset)
+def show(dataset, folder):
+    target = DatasetLocation("test/malicious", dataset)
     return preview(PreviewConfig(target, output_dir=folder / "preview", frames=1, rerun=False))
 
 
-both_commands = pytest.mark.parametrize("command", [derive, look])
+both_commands = pytest.mark.parametrize("command", [derive, show])
 
 
 def change_json(file, **entries):
@@ -57,7 +57,7 @@ def change_columns(file, **columns):
 
 
 def change_image(dataset, key, encoded, path="image.png"):
-    """Put something else in the place of the first image of a feature."""
+    """Replace the first image of a feature."""
     table = pq.read_table(dataset / DATA)
     cells = table[key].to_pylist()
     cells[0] = {"bytes": encoded, "path": str(path)}
@@ -67,21 +67,21 @@ def change_image(dataset, key, encoded, path="image.png"):
 
 
 def make_video_feature(dataset, video_path="videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"):
-    """Say that the camera's colour is in a video."""
+    """Declare the camera's colour images as a video feature."""
     change_feature(dataset, RGB, dtype="video")
     change_info(dataset, video_path=video_path)
-    places = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.0}
-    change_columns(dataset / EPISODES, **{f"videos/{RGB}/{name}": value for name, value in places.items()})
+    location = {"chunk_index": 0, "file_index": 0, "from_timestamp": 0.0}
+    change_columns(dataset / EPISODES, **{f"videos/{RGB}/{name}": value for name, value in location.items()})
 
 
 def png_of(height, width):
-    """The beginning of a PNG file that says it has so many pixels, and holds none."""
+    """Return the header of a PNG file that declares `height` x `width` pixels, without any pixel data."""
     header = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
 
 
 def tiff_of(height, width):
-    """The same of a TIFF file, of float32."""
+    """Return the header of a float32 TIFF file that declares `height` x `width` pixels, without any pixel data."""
     tags = {256: width, 257: height, 258: 32, 259: 1, 262: 1, 273: 8, 277: 1, 278: height, 279: 4, 339: 3}
     entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
     return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + bytes(8)
@@ -92,7 +92,7 @@ def encoded(extension, image):
 
 
 def saved_replay(folder):
-    frame = {"picture": np.zeros(2, np.uint8)}
+    frame = {"image": np.zeros(2, np.uint8)}
     replay = Replay(ReplayConfig(), frame, 2, [2, 2], folder)
     replay.begin(0, frame)
     replay.add(0, np.zeros(2, np.float32), 0.0, True, None)
@@ -101,6 +101,6 @@ def saved_replay(folder):
 
 
 def load_with_processors(folder):
-    """In the order of LeRobot's commands."""
+    """Load a policy and its processors in the order of LeRobot's commands."""
     policy = SymviewBcPolicy.from_pretrained(folder)
     return make_pre_post_processors(policy.config, str(folder))

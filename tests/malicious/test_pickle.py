@@ -1,4 +1,4 @@
-"""No pickle is read: not in weights, replays or calibrations."""
+"""Pickle is never loaded: not from weights, replay buffers or calibrations."""
 
 import ast
 import pickle
@@ -12,12 +12,12 @@ from safetensors import SafetensorError
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview.calibration.file import read_calibration
 from lerobot_symview.errors import SymviewError
-from tests.hostile.files import saved_replay
+from tests.malicious.files import saved_replay
 
 ROOT = Path(__file__).parents[2]
 
 
-class Traitor:
+class Payload:
     """Creates a file when it is unpickled."""
 
     def __init__(self, file):
@@ -27,7 +27,7 @@ class Traitor:
         return Path.touch, (self.file,)
 
 
-def test_no_code_of_ours_reads_pickle():
+def test_our_code_never_loads_pickle():
     forbidden = {"pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
     calls = {"torch.load", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "pd.read_pickle", "eval", "exec"}
     for folder in ("lerobot_symview", "policies", "datasets_gen", "eval", "tools"):
@@ -41,27 +41,31 @@ def test_no_code_of_ours_reads_pickle():
                     assert not any(keyword.arg == "allow_pickle" for keyword in node.keywords), f"{file}:{node.lineno}"
 
 
-def test_pickled_weights_are_refused_unread(checkpoint, tmp_path):
-    (checkpoint / "model.safetensors").write_bytes(pickle.dumps(Traitor(tmp_path / "run")))
+def test_pickled_weights_are_not_loaded(checkpoint, tmp_path):
+    (checkpoint / "model.safetensors").write_bytes(pickle.dumps(Payload(tmp_path / "run")))
     with pytest.raises(SafetensorError):
         SymviewBcPolicy.from_pretrained(checkpoint)
     (checkpoint / "model.safetensors").unlink()
-    torch.save(Traitor(tmp_path / "run"), checkpoint / "pytorch_model.bin")
+    torch.save(Payload(tmp_path / "run"), checkpoint / "pytorch_model.bin")
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
         SymviewBcPolicy.from_pretrained(checkpoint)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_pickled_replay_is_refused_unread(tmp_path):
+def test_a_pickled_replay_is_not_loaded(tmp_path):
     replay = saved_replay(tmp_path / "replay")
-    np.save(tmp_path / "replay" / "picture.npy", np.array([Traitor(tmp_path / "run")], dtype=object), allow_pickle=True)
+    np.save(
+        tmp_path / "replay" / "image.npy",
+        np.array([Payload(tmp_path / "run")], dtype=object),
+        allow_pickle=True,
+    )
     with pytest.raises(ValueError, match="Python objects"):
         replay.load(tmp_path / "replay")
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("tag", ["object/apply:os.system [touch {}]", "object/new:pathlib.Path [{}]", "name:os.system"])
-def test_a_calibration_cannot_name_python_objects(tmp_path, tag):
+def test_a_calibration_cannot_construct_python_objects(tmp_path, tag):
     (tmp_path / "cameras.yaml").write_text(f"units: !!python/{tag.format(tmp_path / 'run')}")
     with pytest.raises(SymviewError, match="could not determine a constructor"):
         read_calibration(tmp_path / "cameras.yaml")

@@ -1,4 +1,4 @@
-"""A processor file of a policy imports and calls nothing."""
+"""A policy's processor file must not import modules or call functions."""
 
 import json
 import shutil
@@ -12,7 +12,7 @@ from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.helpers.policies import make_config
-from tests.hostile.files import change_json, load_with_processors
+from tests.malicious.files import change_json, load_with_processors
 
 
 def add_step(folder, step, name="policy_preprocessor.json"):
@@ -21,50 +21,50 @@ def add_step(folder, step, name="policy_preprocessor.json"):
 
 
 @pytest.fixture
-def strange_step(tmp_path, monkeypatch):
-    """A module that is on the path and not ours to import; it and its step leave a file."""
+def foreign_step(tmp_path, monkeypatch):
+    """A module on the import path that creates a file when it is imported."""
     code = f"from pathlib import Path\nPath({str(tmp_path / 'run')!r}).touch()\ndef Step(): return None\n"
     (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / "strange_steps.py").write_text(code)
+    (tmp_path / "modules" / "foreign_steps.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path / "modules")
-    yield "strange_steps.Step"
-    sys.modules.pop("strange_steps", None)
+    yield "foreign_steps.Step"
+    sys.modules.pop("foreign_steps", None)
 
 
 @pytest.mark.parametrize("name", ["policy_preprocessor.json", "policy_postprocessor.json"])
-def test_a_processor_file_imports_nothing(checkpoint, strange_step, tmp_path, name):
-    add_step(checkpoint, {"class": strange_step}, name)
-    with pytest.raises((ImportError, ValueError), match="strange_steps"):
+def test_a_processor_file_cannot_import_a_module(checkpoint, foreign_step, tmp_path, name):
+    add_step(checkpoint, {"class": foreign_step}, name)
+    with pytest.raises((ImportError, ValueError), match="foreign_steps"):
         load_with_processors(checkpoint)
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
-    ("called", "options"),
+    ("function", "options"),
     [
         ("os.system", {"command": "touch RUN"}),
         ("subprocess.check_call", {"args": ["touch", "RUN"]}),
         ("builtins.open", {"file": "RUN", "mode": "w"}),
     ],
 )
-def test_a_processor_file_calls_nothing(checkpoint, tmp_path, called, options):
+def test_a_processor_file_cannot_call_a_function(checkpoint, tmp_path, function, options):
     config = json.loads(json.dumps(options).replace("RUN", str(tmp_path / "run")))
-    add_step(checkpoint, {"class": called, "config": config})
-    with pytest.raises((ImportError, ValueError), match=called):
+    add_step(checkpoint, {"class": function, "config": config})
+    with pytest.raises((ImportError, ValueError), match=function):
         load_with_processors(checkpoint)
     assert not (tmp_path / "run").exists()
 
 
-def test_processors_alone_import_nothing_either(checkpoint, strange_step, tmp_path):
-    """As a robot's own program loads them, without or before the policy."""
-    add_step(checkpoint, {"class": strange_step})
-    with pytest.raises((ImportError, ValueError), match="strange_steps"):
+def test_processors_without_a_policy_cannot_import_a_module(checkpoint, foreign_step, tmp_path):
+    """A robot's own program may load them before the policy, or without it."""
+    add_step(checkpoint, {"class": foreign_step})
+    with pytest.raises((ImportError, ValueError), match="foreign_steps"):
         make_pre_post_processors(make_config(), str(checkpoint))
     assert not (tmp_path / "run").exists()
 
 
-def test_a_registered_step_that_runs_code_from_the_hub_is_not_made(checkpoint, monkeypatch):
-    """LeRobot's `action_tokenizer_processor` trusts what the repository that it is told to load brings along."""
+def test_a_registered_step_cannot_run_code_from_the_hub(checkpoint, monkeypatch):
+    """LeRobot's `action_tokenizer_processor` would run code of the repository that its configuration names."""
     loaded = []
 
     class Recorder:
@@ -83,22 +83,22 @@ def test_a_registered_step_that_runs_code_from_the_hub_is_not_made(checkpoint, m
 
 
 @pytest.mark.parametrize("file", ["../weights.safetensors", "WEIGHTS"])
-def test_the_state_of_a_step_is_in_the_policys_folder(checkpoint, tmp_path, file):
+def test_the_state_file_of_a_step_must_be_inside_the_policy(checkpoint, tmp_path, file):
     shutil.copy(checkpoint / "model.safetensors", tmp_path / "weights.safetensors")
-    stated = file.replace("WEIGHTS", str(tmp_path / "weights.safetensors"))
-    add_step(checkpoint, {"registry_name": "device_processor", "config": {"device": "cpu"}, "state_file": stated})
+    state_file = file.replace("WEIGHTS", str(tmp_path / "weights.safetensors"))
+    add_step(checkpoint, {"registry_name": "device_processor", "config": {"device": "cpu"}, "state_file": state_file})
     with pytest.raises(ValueError, match="state_file"):
         load_with_processors(checkpoint)
 
 
-def test_a_processor_file_makes_views_of_a_possible_size(checkpoint):
+def test_a_processor_file_cannot_request_huge_views(checkpoint):
     add_step(checkpoint, {"registry_name": "symview_views", "config": {"views": {"persp": {"size": 10**6}}}})
     with pytest.raises(ValueError, match="size must"):
         load_with_processors(checkpoint)
 
 
 @pytest.mark.parametrize("kind", [SymviewBcConfig, SymviewSacfdConfig])
-def test_our_own_processors_name_registered_steps_only(kind):
+def test_our_processors_use_registered_steps_only(kind):
     for pipeline in make_processors(make_config(kind)):
         for step in pipeline.get_config()["steps"]:
             assert "class" not in step

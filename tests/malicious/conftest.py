@@ -1,4 +1,4 @@
-"""Copies of harmless datasets and policies, for tests to change."""
+"""Copies of valid datasets and policies, which the tests modify."""
 
 import shutil
 
@@ -6,19 +6,19 @@ import pytest
 
 from lerobot_policy_symview.processor_pipelines import make_processors
 from tests.helpers.policies import make_policy
-from tests.hostile.files import DATA
+from tests.malicious.files import DATA
 
 
 @pytest.fixture
 def dataset(recorded, tmp_path):
-    """A copy of a harmless dataset."""
-    return shutil.copytree(recorded, tmp_path / "strangers" / "dataset")
+    """A copy of a valid dataset."""
+    return shutil.copytree(recorded, tmp_path / "download" / "dataset")
 
 
 @pytest.fixture
 def outside(recorded, tmp_path):
-    """A folder beside the dataset, with a table that could be one of its own."""
-    folder = tmp_path / "strangers" / "private"
+    """A private folder beside the dataset, with a table in the format of the dataset's own."""
+    folder = tmp_path / "download" / "private"
     (folder / "chunk-000").mkdir(parents=True)
     shutil.copy(recorded / DATA, folder / "chunk-000" / "file-000.parquet")
     (folder / "secret.txt").write_text("secret")
@@ -26,7 +26,7 @@ def outside(recorded, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def harmless_policy(tmp_path_factory):
+def valid_policy(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policy")
     policy = make_policy()
     for part in (policy, *make_processors(policy.config)):
@@ -35,6 +35,6 @@ def harmless_policy(tmp_path_factory):
 
 
 @pytest.fixture
-def checkpoint(harmless_policy, tmp_path):
-    """A copy of a harmless policy."""
-    return shutil.copytree(harmless_policy, tmp_path / "checkpoint")
+def checkpoint(valid_policy, tmp_path):
+    """A copy of a valid policy."""
+    return shutil.copytree(valid_policy, tmp_path / "checkpoint")

@@ -1,4 +1,4 @@
-"""Sizes that files declare are checked before memory is taken."""
+"""Sizes declared in files are checked before memory is allocated."""
 
 import json
 import struct
@@ -20,7 +20,7 @@ from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.helpers.cameras import make_camera
 from tests.helpers.policies import make_config
-from tests.hostile.files import (
+from tests.malicious.files import (
     DATA,
     DEPTH,
     EPISODES,
@@ -31,10 +31,10 @@ from tests.hostile.files import (
     change_image,
     derive,
     encoded,
-    look,
     make_video_feature,
     png_of,
     saved_replay,
+    show,
     tiff_of,
 )
 
@@ -50,16 +50,16 @@ from tests.hostile.files import (
         (DEPTH, encoded(".tiff", np.ones((300, 290), np.float32)), "300 x 290"),
     ],
 )
-def test_images_are_no_larger_than_declared(dataset, tmp_path, command, key, data, size):
+def test_images_must_have_the_declared_size(dataset, tmp_path, command, key, data, size):
     change_image(dataset, key, data)
     with pytest.raises(ValueError, match=f"{size}.*152 x 152"):
         command(dataset, tmp_path)
 
 
-def test_an_image_without_bytes_is_none(dataset, tmp_path):
+def test_an_empty_image_is_refused(dataset, tmp_path):
     change_image(dataset, RGB, b"")
     with pytest.raises(ValueError, match="no image"):
-        look(dataset, tmp_path)
+        show(dataset, tmp_path)
 
 
 def write_video(dataset, height, width, frames):
@@ -73,22 +73,22 @@ def write_video(dataset, height, width, frames):
         container.mux(stream.encode())
 
 
-def test_videos_are_no_larger_than_declared(dataset, tmp_path):
+def test_videos_must_have_the_declared_size(dataset, tmp_path):
     write_video(dataset, 304, 320, frames=16)
     with pytest.raises(ValueError, match=r"304 x 320.*152 x 152"):
-        look(dataset, tmp_path)
+        show(dataset, tmp_path)
 
 
-def test_no_more_of_a_video_is_decoded_than_there_are_frames(dataset, tmp_path):
-    """All from the first wanted moment to the last is decoded at a time."""
+def test_distant_video_frames_are_refused(dataset, tmp_path):
+    """Decoding covers the whole range from the first to the last requested timestamp."""
     write_video(dataset, 152, 152, frames=400)
-    moments = pq.read_table(dataset / DATA)["timestamp"].to_numpy() * 50
-    change_columns(dataset / DATA, timestamp=pa.array(moments, pa.float32()))
+    timestamps = pq.read_table(dataset / DATA)["timestamp"].to_numpy() * 50
+    change_columns(dataset / DATA, timestamp=pa.array(timestamps, pa.float32()))
     with pytest.raises(SymviewError, match="frames of video apart"):
         derive(dataset, tmp_path)
 
 
-def test_declarations_of_symmetry_are_no_longer_than_a_robot_has_entries():
+def test_symmetry_declarations_have_a_maximum_length():
     with pytest.raises(ValueError, match=r"--policy\.state_symmetry has 100000 entries"):
         SymviewBcConfig(device="cpu", gripper_input="vector", state_symmetry=["scalar"] * 10**5)
 
@@ -96,14 +96,14 @@ def test_declarations_of_symmetry_are_no_longer_than_a_robot_has_entries():
 @pytest.mark.parametrize(
     "shape", [[10**9, 10**9, 3], [20_000, 20_000, 3], [-8, 8, 3], [0, 8, 3], [152, 152], [152.5, 152, 3], "huge", None]
 )
-def test_declared_shapes_of_images_are_possible(dataset, shape):
+def test_invalid_image_shapes_are_refused(dataset, shape):
     change_feature(dataset, RGB, shape=shape)
     with pytest.raises(SymviewError, match=f"{RGB}.*shape"):
         SourceDataset(dataset)
 
 
-def test_there_are_no_more_episodes_than_declared(dataset):
-    """Rows that are alike take next to nothing in a file."""
+def test_more_episodes_than_declared_are_refused(dataset):
+    """Equal rows compress to almost nothing."""
     table = pq.read_table(dataset / EPISODES)
     pq.write_table(table.take(pa.array(np.zeros(20_000, int))), dataset / EPISODES, compression="zstd")
     with pytest.raises(SymviewError, match=r"20000.*total_episodes"):
@@ -123,7 +123,7 @@ def test_there_are_no_more_episodes_than_declared(dataset):
         ("episode_index", 9),
     ],
 )
-def test_episodes_are_where_there_are_frames(dataset, tmp_path, command, column, value):
+def test_invalid_episode_ranges_are_refused(dataset, tmp_path, command, column, value):
     values = pq.read_table(dataset / EPISODES)[column].to_pylist()
     change_columns(dataset / EPISODES, **{column: pa.array([*map(type(value), values[:-1]), value])})
     with pytest.raises(SymviewError, match=column):
@@ -131,15 +131,15 @@ def test_episodes_are_where_there_are_frames(dataset, tmp_path, command, column,
 
 
 @both_commands
-def test_rows_are_no_larger_than_declared(dataset, tmp_path, command):
-    """64 MiB of zeros that a table of a few kilobytes unpacks to."""
+def test_rows_larger_than_declared_are_refused(dataset, tmp_path, command):
+    """A table of a few kilobytes decompresses to 64 MiB of zeros."""
     change_image(dataset, RGB, bytes(2**26))
     with pytest.raises(SymviewError, match=r"file-000\.parquet.*bytes"):
         command(dataset, tmp_path)
 
 
 @pytest.mark.parametrize("view", list(VIEWS))
-def test_views_are_of_a_possible_size(view):
+def test_huge_views_are_refused(view):
     with pytest.raises(ValueError, match="size must"):
         make_view(view, size=10**6)
 
@@ -155,7 +155,7 @@ def test_views_are_of_a_possible_size(view):
         {"calibration": {"cameras": "front"}},
     ],
 )
-def test_a_policy_takes_over_only_what_can_be_a_view(with_views, facts):
+def test_a_policy_refuses_invalid_view_options_of_a_dataset(with_views, facts):
     features = json.loads((with_views / "meta" / "info.json").read_text())["features"]
     features[keys.view("side", "reproj")]["info"]["symview"] |= facts
     with pytest.raises(ValueError, match=keys.view("side", "reproj")):
@@ -164,24 +164,24 @@ def test_a_policy_takes_over_only_what_can_be_a_view(with_views, facts):
 
 @both_commands
 @pytest.mark.parametrize("workspace", [{"size": 1e400}, {"size": 0.4, "command": "rm"}, {"center": "ab"}, "here"])
-def test_a_dataset_states_a_possible_workspace(dataset, tmp_path, command, workspace):
+def test_an_invalid_workspace_in_a_dataset_is_refused(dataset, tmp_path, command, workspace):
     change_feature(dataset, RGB, info={"symview": {"workspace": workspace}})
     with pytest.raises(ValueError, match="workspace"):
         command(dataset, tmp_path)
 
 
 @pytest.mark.parametrize("entries", [{"size": float("nan")}, {"height_limit": 1e400}, {"center": [float("nan"), 0]}])
-def test_a_workspace_is_finite(entries):
+def test_an_infinite_workspace_is_refused(entries):
     with pytest.raises(CalibrationError, match="finite"):
         parse_workspace(entries)
 
 
-def test_networks_are_of_a_possible_width():
+def test_huge_networks_are_refused():
     with pytest.raises(ValueError, match=r"--policy\.width"):
         SymviewBcConfig(device="cpu", width=16 * 10**5)
 
 
-def test_saved_arrays_are_no_larger_than_their_files(checkpoint, tmp_path):
+def test_arrays_larger_than_their_files_are_refused(checkpoint, tmp_path):
     shape = [10**12]
     header = json.dumps({"x": {"dtype": "F32", "shape": shape, "data_offsets": [0, 4 * shape[0]]}}).encode()
     (checkpoint / "model.safetensors").write_bytes(struct.pack("<Q", len(header)) + header)
@@ -189,12 +189,12 @@ def test_saved_arrays_are_no_larger_than_their_files(checkpoint, tmp_path):
         SymviewBcPolicy.from_pretrained(checkpoint)
     replay = saved_replay(tmp_path / "replay")
     header = f"{{'descr': '|u1', 'fortran_order': False, 'shape': ({shape[0]}, 2), }}".ljust(117).encode() + b"\n"
-    (tmp_path / "replay" / "picture.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header + bytes(8))
+    (tmp_path / "replay" / "image.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header + bytes(8))
     with pytest.raises(ValueError, match="greater than file size"):
         replay.load(tmp_path / "replay")
 
 
-def test_a_narrow_image_is_not_enlarged_without_limit(workspace):
+def test_the_enlargement_of_a_narrow_image_is_limited(workspace):
     camera = make_camera(size=152)
-    picture = with_outline(np.zeros((1, 400, 3), np.uint8), camera, workspace)
-    assert max(picture.shape) <= 4 * TILE
+    image = with_outline(np.zeros((1, 400, 3), np.uint8), camera, workspace)
+    assert max(image.shape) <= 4 * TILE
