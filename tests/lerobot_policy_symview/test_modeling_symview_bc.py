@@ -10,7 +10,7 @@ from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.equivariance import example_observation
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.nn.encoders.convolutional import ENCODERS
+from lerobot_policy_symview.nn.encoders.registry import ENCODERS
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
 from lerobot_symview.views import VIEWS, ReprojectedView
@@ -290,7 +290,7 @@ def test_a_side_view_is_that_of_the_named_camera():
 
 
 def test_the_configuration_offers_what_the_networks_have():
-    assert tuple(ENCODERS) == ENCODER_NAMES
+    assert ENCODERS.builtin == ENCODER_NAMES
     for crop_size in CROP_SIZES:
         SymviewBcPolicy(make_config(crop_size=crop_size))
     for preset in METHODS.values():

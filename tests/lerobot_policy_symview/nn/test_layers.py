@@ -1,4 +1,4 @@
-"""Every layer against the definition of equivariance, and against escnn."""
+"""Every layer against the definition of equivariance, and the image encoder against escnn."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def double():
 
 
 def mixed_inputs(group):
-    """Two scalars, a vector and a sign."""
+    """Representation of two scalars, a vector and a pseudoscalar."""
     ones, signs = np.ones((group.size, 1, 1)), group.determinants[:, None, None]
     return block_diagonal([ones, ones, group.rotation(), signs])
 
@@ -48,13 +48,13 @@ LAYERS = {
     "full": (FieldConv2d, (0, True), (2, 5, 6, 6)),
     "relaxed": (RelaxedConv2d, (1,), (2, 5, 6, 6)),
     "voxel": (FieldConv3d, ((1, 0, 0),), (2, 5, 4, 6, 6)),
-    "voxel two layers high": (FieldConv3d, ((0, 0, 0), 2), (2, 5, 4, 6, 6)),
+    "voxel of depth two": (FieldConv3d, ((0, 0, 0), 2), (2, 5, 4, 6, 6)),
 }
 
 
 @pytest.mark.parametrize("name", EXACT)
 @pytest.mark.parametrize(("layer", "options", "shape"), LAYERS.values(), ids=LAYERS)
-def test_convolutions_are_equivariant_from_representations_and_from_fields(layer, options, shape, name):
+def test_convolutions_are_equivariant(layer, options, shape, name):
     group = make_group(name)
     first = layer(group, mixed_inputs(group), 3, *options)
     second = FieldConv2d(group, 3, 2, 0) if len(shape) == 4 else FieldConv3d(group, 3, 2, (1, 0, 0))
@@ -73,7 +73,7 @@ def test_convolutions_are_equivariant_from_representations_and_from_fields(layer
 
 
 @pytest.mark.parametrize("name", ["D4", "C4", "D8", "C8"])
-def test_linear_maps_are_equivariant(name):
+def test_linear_layers_are_equivariant(name):
     group = make_group(name)
     first, second = FieldLinear(group, mixed_inputs(group), 3), FieldLinear(group, 3, 2)
     values = torch.randn(4, 5)
@@ -85,7 +85,7 @@ def test_linear_maps_are_equivariant(name):
 
 
 @pytest.mark.parametrize("name", ["D8", "C8"])
-def test_turns_by_45_degrees_are_equivariant_up_to_interpolation(name):
+def test_rotations_by_45_degrees_are_equivariant_up_to_interpolation(name):
     """On smooth images two layers are a few percent off; quarter turns are exact."""
     group = make_group(name)
     first, second = FieldConv2d(group, np.ones((group.size, 1, 1)), 4, 1), FieldConv2d(group, 4, 2, 1)
@@ -102,7 +102,7 @@ def test_turns_by_45_degrees_are_equivariant_up_to_interpolation(name):
             assert error > 1e-4 or element % 2 == 0
 
 
-def test_relaxed_layers_lose_their_symmetry_when_gains_differ():
+def test_relaxed_layers_are_not_equivariant_if_gains_differ():
     layer = RelaxedConv2d(D4, 2, 2, 1)
     assert layer.asymmetry() == 0
     with torch.no_grad():
@@ -113,7 +113,7 @@ def test_relaxed_layers_lose_their_symmetry_when_gains_differ():
         assert (moved - move_pixels(move_fields(layer(images), D4, 1), D4, 1)).abs().max() > 0.1
 
 
-def test_expanded_filters_are_kept_until_weights_change():
+def test_expanded_filters_are_cached_until_weights_change():
     layer, images = FieldConv2d(D4, 2, 2, 1), torch.randn(1, 16, 6, 6)
     with torch.no_grad():
         first = layer.expanded()[0]
@@ -127,19 +127,19 @@ def test_expanded_filters_are_kept_until_weights_change():
     assert layer.expanded()[0].requires_grad
 
 
-def test_a_switch_to_evaluation_sees_weights_that_were_swapped_unnoticed():
-    """As libraries do that average weights: through `.data`, which raises no version."""
+def test_switching_to_evaluation_clears_the_cache():
+    """Libraries that average weights assign through `.data`, which counts no version."""
     layer, images = FieldConv2d(D4, 2, 2, 1).eval(), torch.randn(1, 16, 6, 6)
     with torch.no_grad():
-        kept = layer.eval().expanded()[0]
-        assert layer.eval().expanded()[0] is kept
+        cached = layer.eval().expanded()[0]
+        assert layer.eval().expanded()[0] is cached
         before = layer(images)
         layer.train().weight.data.mul_(2)
         assert not torch.equal(layer.eval()(images), before)
 
 
 @pytest.mark.parametrize("channels", [5, 2])
-def test_our_encoder_computes_what_escnn_computes(channels):
+def test_the_encoder_computes_the_same_function_as_escnn(channels):
     state = np.ones((8, 1, 1))
     torch.set_default_dtype(torch.float32)  # escnn shares its bases among networks: in float64 they would break others
     encoder = ImageEncoder(D4, channels - 1, state, [2, 4], (4, 3, 2))
@@ -149,7 +149,7 @@ def test_our_encoder_computes_what_escnn_computes(channels):
     reference.eval()
     load_from_escnn(encoder, reference)
     assert sum(p.numel() for p in encoder.parameters()) == sum(p.numel() for p in reference.parameters())
-    picture, scalar = torch.randn(2, channels - 1, 32, 32), torch.randn(2, 1)
+    images, scalar = torch.randn(2, channels - 1, 32, 32), torch.randn(2, 1)
     with torch.no_grad():
-        expected = reference(picture, scalar)
-        torch.testing.assert_close(encoder(picture, scalar), expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
+        expected = reference(images, scalar)
+        torch.testing.assert_close(encoder(images, scalar), expected, rtol=1e-4, atol=1e-5 * expected.abs().max())
