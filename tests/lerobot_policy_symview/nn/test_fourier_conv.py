@@ -43,11 +43,11 @@ def images_for(layer, batch=2, height=8, width=8):
     return torch.randn(batch, layer.weight.shape[1], height, width, dtype=layer.weight.dtype)
 
 
-def assert_near(found, expected):
+def assert_near(actual, expected):
     limit = TOLERANCES[expected.dtype] * expected.abs().max()
-    assert found.dtype == expected.dtype
-    assert found.shape == expected.shape
-    assert (found - expected).abs().max() <= limit
+    assert actual.dtype == expected.dtype
+    assert actual.shape == expected.shape
+    assert (actual - expected).abs().max() <= limit
 
 
 def is_fast(layer, images, pool=False):
@@ -80,9 +80,9 @@ def test_outputs_and_gradients_match_the_dense_convolution(inputs, fields, heigh
         out.backward(torch.linspace(-1, 1, out.numel(), dtype=dtype).view(out.shape).cos())
         results.append([out.detach(), layer.weight.grad, layer.bias.grad, given.grad])
     assert is_fast(pair[1], images, pool)
-    for expected, found in zip(*results, strict=True):
+    for expected, actual in zip(*results, strict=True):
         if expected is not None:
-            assert_near(found, expected)
+            assert_near(actual, expected)
 
 
 @pytest.mark.parametrize("pool", [False, True])
@@ -91,8 +91,8 @@ def test_the_layer_is_equivariant(pool):
     images = images_for(layer)
     expected = layer(images, pool).unflatten(1, (D4.size, -1))
     for element in range(D4.size):
-        found = layer(transform(images, element), pool).unflatten(1, (D4.size, -1))
-        assert_near(found, transform(expected.flatten(1, 2), element).unflatten(1, (D4.size, -1)))
+        actual = layer(transform(images, element), pool).unflatten(1, (D4.size, -1))
+        assert_near(actual, transform(expected.flatten(1, 2), element).unflatten(1, (D4.size, -1)))
 
 
 def transform(images, element):
@@ -199,15 +199,15 @@ def test_concurrent_python_threads_get_the_same_results():
 def test_forked_processes_start_new_threads():
     assert sum(map(len, square_in_threads())) == 4
     with multiprocessing.get_context("fork").Pool(1) as pool:
-        found = pool.apply_async(square_in_threads).get(timeout=60)
-    assert sorted(chain.from_iterable(found)) == [0, 1, 4, 9]
+        actual = pool.apply_async(square_in_threads).get(timeout=60)
+    assert sorted(chain.from_iterable(actual)) == [0, 1, 4, 9]
 
 
 @pytest.mark.skipif(not torch.backends.mkl.is_available(), reason="this PyTorch has no MKL")
 def test_matrix_products_in_a_worker_thread_start_no_further_threads():
     """MKL's number of threads is the process's: with two workers there were four threads on two cores."""
-    found = in_threads(lambda found, _: found.append(mkl_threads()), range(2), list)
-    assert found == [["1"], ["1"]]
+    actual = in_threads(lambda results, _: results.append(mkl_threads()), range(2), list)
+    assert actual == [["1"], ["1"]]
     assert mkl_threads() == "2"
 
 
@@ -216,7 +216,7 @@ def mkl_threads():
 
 
 def square_in_threads():
-    return in_threads(lambda found, task: found.append(task**2), range(4), list)
+    return in_threads(lambda results, task: results.append(task**2), range(4), list)
 
 
 def test_blocks_cover_every_pixel_once_and_split_a_single_image():

@@ -28,16 +28,16 @@ def mixed_inputs(group):
     return block_diagonal([ones, ones, group.rotation(), signs])
 
 
-def move_channels(values, matrices, element):
+def transform_channels(values, matrices, element):
     return torch.einsum("ij,bj...->bi...", torch.tensor(matrices[element]), values)
 
 
-def move_fields(values, group, element):
+def transform_fields(values, group, element):
     fields = values.unflatten(1, (group.size, -1))
     return fields[:, torch.tensor(group.quotient[element])].flatten(1, 2)
 
 
-def move_pixels(values, group, element):
+def transform_pixels(values, group, element):
     flipped = values.flip(-1) if group.flips(element) else values
     return torch.rot90(flipped, 4 * (element % group.turns) // group.turns, (-2, -1))
 
@@ -66,9 +66,9 @@ def test_convolutions_are_equivariant(layer, options, shape, name):
     with torch.no_grad():
         expected = network(images)
         for element in range(group.size):
-            moved = move_pixels(move_channels(images, mixed_inputs(group), element), group, element)
+            transformed = transform_pixels(transform_channels(images, mixed_inputs(group), element), group, element)
             torch.testing.assert_close(
-                network(moved), move_pixels(move_fields(expected, group, element), group, element)
+                network(transformed), transform_pixels(transform_fields(expected, group, element), group, element)
             )
 
 
@@ -80,8 +80,8 @@ def test_linear_layers_are_equivariant(name):
     with torch.no_grad():
         expected = second(torch.relu(first(values)))
         for element in range(group.size):
-            moved = second(torch.relu(first(move_channels(values, mixed_inputs(group), element))))
-            torch.testing.assert_close(moved, move_fields(expected, group, element), rtol=1e-6, atol=1e-9)
+            transformed = second(torch.relu(first(transform_channels(values, mixed_inputs(group), element))))
+            torch.testing.assert_close(transformed, transform_fields(expected, group, element), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["D8", "C8"])
@@ -95,8 +95,8 @@ def test_rotations_by_45_degrees_are_equivariant_up_to_interpolation(name):
         expected = second(torch.relu(first(images)))
         for element in range(group.size):
             motion = Motion.of_element(group, element, images.flatten(1))
-            moved = second(torch.relu(first(move_images(images, motion))))[middle]
-            difference = moved - move_images(move_fields(expected, group, element), motion)[middle]
+            transformed = second(torch.relu(first(move_images(images, motion))))[middle]
+            difference = transformed - move_images(transform_fields(expected, group, element), motion)[middle]
             error = difference.abs().max() / expected[middle].abs().max()
             assert error < (1e-10 if element % 2 == 0 else 0.1)
             assert error > 1e-4 or element % 2 == 0
@@ -109,8 +109,8 @@ def test_relaxed_layers_are_not_equivariant_if_gains_differ():
         layer.gains += torch.arange(8) * 0.1
         assert layer.asymmetry() == pytest.approx(0.1 * sum(j - i for i in range(8) for j in range(i + 1, 8)))
         images = torch.randn(1, 16, 6, 6)
-        moved = layer(move_pixels(move_fields(images, D4, 1), D4, 1))
-        assert (moved - move_pixels(move_fields(layer(images), D4, 1), D4, 1)).abs().max() > 0.1
+        transformed = layer(transform_pixels(transform_fields(images, D4, 1), D4, 1))
+        assert (transformed - transform_pixels(transform_fields(layer(images), D4, 1), D4, 1)).abs().max() > 0.1
 
 
 def test_expanded_filters_are_cached_until_weights_change():

@@ -70,10 +70,10 @@ def test_the_actor_is_equivariant_and_the_critic_invariant_after_updates(method)
 
     expected = q(raw, action)
     for element in (1, group.turns, group.size - 1):  # a rotation and a reflection generate the others
-        moved = move_observation(raw, config, group, element)
-        turned = config.actions.move(action, Motion.of_element(group, element, action), absolute_yaw=False)
-        torch.testing.assert_close(q(moved, turned), expected, rtol=1e-9, atol=1e-11)
-        assert (q(moved, action) - expected).abs().max() > 1e-6
+        transformed = move_observation(raw, config, group, element)
+        transformed_action = config.actions.move(action, Motion.of_element(group, element, action), absolute_yaw=False)
+        torch.testing.assert_close(q(transformed, transformed_action), expected, rtol=1e-9, atol=1e-11)
+        assert (q(transformed, action) - expected).abs().max() > 1e-6
 
 
 def test_the_action_distribution_is_equivariant():
@@ -85,10 +85,10 @@ def test_the_action_distribution_is_equivariant():
     assert torch.equal(log_std[:, 0], log_std[:, 1])
     assert log_std[0].unique().numel() == 4
     for element in range(1, group.size):
-        moved = policy.network(*policy.network_input(move_observation(raw, config, group, element)))
-        turned = config.actions.move(mean, Motion.of_element(group, element, mean), absolute_yaw=False)
-        torch.testing.assert_close(moved[0], turned, rtol=1e-9, atol=1e-11)
-        torch.testing.assert_close(moved[1], log_std, rtol=1e-9, atol=1e-11)
+        transformed = policy.network(*policy.network_input(move_observation(raw, config, group, element)))
+        transformed_action = config.actions.move(mean, Motion.of_element(group, element, mean), absolute_yaw=False)
+        torch.testing.assert_close(transformed[0], transformed_action, rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(transformed[1], log_std, rtol=1e-9, atol=1e-11)
 
 
 def test_the_plain_actor_is_not_equivariant():
@@ -167,8 +167,8 @@ def test_the_critic_is_updated_by_its_own_loss_only():
     for learner in (ours, other):
         torch.manual_seed(1)
         learner.update(make_sample(learner))
-    for one, two in zip(ours.critic.parameters(), other.critic.parameters(), strict=True):
-        assert torch.equal(one, two)
+    for first, second in zip(ours.critic.parameters(), other.critic.parameters(), strict=True):
+        assert torch.equal(first, second)
 
 
 def test_the_critic_encodes_each_observation_once():
@@ -235,5 +235,5 @@ def test_a_loaded_learner_makes_the_same_updates(tmp_path):
         torch.manual_seed(1)
         for _ in range(2):
             learner.update(sample)
-    for one, two in zip(ours.state_dict().values(), other.state_dict().values(), strict=True):
-        assert torch.equal(one, two)
+    for first, second in zip(ours.state_dict().values(), other.state_dict().values(), strict=True):
+        assert torch.equal(first, second)

@@ -33,7 +33,7 @@ def add_episode(replay, stream, numbers, terminal=True):
 
 def transitions(replay):
     """Return every transition that can be sampled: (frame number, next frame number, reward, terminal)."""
-    found = set()
+    sampled = set()
     rng = np.random.default_rng(0)
     for _ in range(30):
         sample = replay.sample(64, 0.4, rng)
@@ -41,8 +41,8 @@ def transitions(replay):
         assert torch.equal(sample.frames["image"][:, 0, 0, 0].float(), sample.frames["state"][:, 0] % 256)
         assert torch.equal(sample.action[:, 0], before)
         rows = zip(before.tolist(), after.tolist(), sample.reward.tolist(), sample.terminal.tolist(), strict=True)
-        found |= set(rows)
-    return found
+        sampled |= set(rows)
+    return sampled
 
 
 def test_the_next_frame_of_a_transition_is_from_the_same_stream(tmp_path):

@@ -1,6 +1,6 @@
 """Convolutional encoders of images and voxel grids.
 
-The plain encoder has the equivariant one's layout for the trivial group.
+The plain encoder has the layout of the equivariant encoder for the trivial group.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ UNIT = 0.1  # metres; coordinates are divided by it, so that they are of the ord
 
 
 class PointEncoder(Encoder):
-    """Three set abstractions at two scales and a global one; 1.2 M parameters at width 64.
+    """Three set abstractions at two scales, then a global set abstraction; 1.2 M parameters at width 64.
 
     Args:
         group: G elements.
