@@ -26,7 +26,7 @@ def main(demonstrations: int, steps: int, simulators: int, episodes: int, output
     config = TrainRlConfig(
         dataset=dataset,
         env=EnvSettings(task="block_picking"),
-        policy=SymviewSacfdConfig(device="cpu", width=16, crop_size=64, expert_weight=10, weight_averaging=0.99),
+        policy=SymviewSacfdConfig(device="cpu", width=16, crop_size=64, bc_weight=10, weight_averaging=0.99),
         output_dir=output_dir / "sacfd",
         steps=steps,
         batch_size=32,

@@ -15,7 +15,7 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, observed
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, simulator_config
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
@@ -42,7 +42,7 @@ def main(dataset: Path | None, steps: int, episodes: int, output_dir: Path) -> N
     checkpoint = output_dir / "policy" / "checkpoints" / "last" / "pretrained_model"
     actor = Actor(SymviewBcPolicy.from_pretrained(checkpoint))
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes)
-    with Simulators(observed(actor.policy.config, EnvSettings("block_picking")), count=2) as simulators:
+    with Simulators(simulator_config(actor.policy.config, EnvSettings("block_picking")), count=2) as simulators:
         found = evaluate(actor, simulators, seeds, discount=0.99)
     logger.info("%d of %d episodes succeed, by the policy in %s", sum(found.success), episodes, checkpoint)
 

@@ -17,7 +17,7 @@ from lerobot.scripts.lerobot_train import train
 
 from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.rl.rollouts import Actor, evaluate, observed
+from lerobot_policy_symview.rl.rollouts import Actor, evaluate, simulator_config
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
@@ -45,7 +45,7 @@ def main(steps: int, episodes: int, demonstrations: int, noise: float, seed: int
     for checkpoint in sorted((output_dir / f"policy_{noise:g}_{seed}" / "checkpoints").glob("0*")):
         act = Actor(SymviewBcPolicy.from_pretrained(checkpoint / "pretrained_model"))
         looks = act, lambda seen, act=act: act([*map(as_if_open, seen)])
-        with Simulators(observed(act.policy.config, EnvSettings("block_picking")), count=2) as simulators:
+        with Simulators(simulator_config(act.policy.config, EnvSettings("block_picking")), count=2) as simulators:
             rates = [100 * evaluate(one, simulators, range(1000, 1000 + episodes), 0.99).success_rate for one in looks]
         logger.info("step %s: %.0f %%, %.0f %% as if open", checkpoint.name, *rates)
 

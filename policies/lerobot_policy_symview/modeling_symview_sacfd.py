@@ -1,4 +1,4 @@
-"""The actor of soft actor-critic from demonstrations; what its training needs besides is in `rl`."""
+"""The actor of soft actor-critic from demonstrations; `rl` has the critic's updates and the training loop."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfi
 from lerobot_policy_symview.nn.heads import GaussianHead
 from lerobot_policy_symview.policy import Network, SymviewPolicy
 
-HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
-SMALLEST_SLOPE = 1e-6  # of tanh, where an action is at the end of its range
+HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+EPSILON = 1e-6  # keeps the logarithm finite where tanh saturates and 1 - action ** 2 is 0
 
 
 class SymviewSacfdPolicy(SymviewPolicy):
-    """Draws scaled actions tanh(x) of normally distributed x; evaluated, it takes tanh of the mean.
+    """Tanh-squashed Gaussian policy: it samples actions tanh(x), x ~ N(mean, std), and evaluates with tanh(mean).
 
-    The distribution moves with the scene. `lerobot-train` fits its evaluated action to demonstrations;
-    `symview-train-rl` learns from reward as well.
+    The whole distribution is equivariant. `lerobot-train` clones demonstrations with the evaluation action;
+    `symview-train-rl` also learns from rewards.
     """
 
     config_class = SymviewSacfdConfig
@@ -37,26 +37,30 @@ class SymviewSacfdPolicy(SymviewPolicy):
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Return the squared error of the evaluated action, scaled, mean or (B,), and nothing to log."""
-        picture, state, action = self.training_input(batch)
-        best = self.best_action(self.network, picture, state)
-        errors = functional.mse_loss(best, action, reduction="none").mean(dim=1)
+        """Return the squared error of the scaled evaluation action, a scalar or per sample (B,), and no metrics."""
+        observation, state, action = self.training_input(batch)
+        mode = self.best_action(self.network, observation, state)
+        errors = functional.mse_loss(mode, action, reduction="none").mean(dim=1)
         return (errors if reduction == "none" else errors.mean()), {}
 
-    def best_action(self, network: Network, picture: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A): tanh of the mean."""
-        mean, _ = network(picture, state)
+    def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
+        """Return the scaled evaluation action (B, A): tanh(mean)."""
+        mean, _ = network(observation, state)
         return torch.tanh(mean)
 
-    def draw(self, picture: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return scaled actions (B, A) at random, differentiably, and the logarithms (B,) of their densities."""
-        mean, log_std = self.network(picture, state)
+    def sample_action(self, observation: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample scaled actions with the reparametrisation trick.
+
+        Returns:
+            Actions (B, A) in [-1, 1] and their log-probabilities (B,).
+        """
+        mean, log_std = self.network(observation, state)
         noise = torch.randn_like(mean)
         action = torch.tanh(mean + log_std.exp() * noise)
-        return action, log_density(action, noise, log_std)
+        return action, log_prob_of(action, noise, log_std)
 
 
-def log_density(action: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
-    """Return log p (B,) of actions tanh(mean + std noise), all (B, A) (Haarnoja et al., 2018, appendix C)."""
-    normal = -0.5 * noise**2 - log_std - HALF_LOG_TAU
-    return (normal - torch.log(1 - action**2 + SMALLEST_SLOPE)).sum(dim=1)
+def log_prob_of(action: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
+    """Return log pi (B,) of actions tanh(mean + std noise), all (B, A) (Haarnoja et al., 2018, appendix C)."""
+    normal = -0.5 * noise**2 - log_std - HALF_LOG_TWO_PI
+    return (normal - torch.log(1 - action**2 + EPSILON)).sum(dim=1)

@@ -8,7 +8,7 @@ from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_policy_symview.processor_views import IN_METRES, ViewsProcessorStep, delivered_units
-from lerobot_policy_symview.rl.rollouts import observed as simulated
+from lerobot_policy_symview.rl.rollouts import simulator_config
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import stored_camera
@@ -218,10 +218,10 @@ def test_a_view_that_needs_a_gripper_is_refused_where_the_state_has_none(observe
 
 def test_simulators_are_refused_where_the_declared_state_is_not_theirs(observed):
     _, kinds = reordered(observed)
-    assert simulated(make_config(), EnvSettings("block_picking")).names
+    assert simulator_config(make_config(), EnvSettings("block_picking")).names
     kinds.remove("scalar")
     with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* it is x, y, z, yaw, aperture"):
-        simulated(make_config(state_symmetry=kinds), EnvSettings("block_picking"))
+        simulator_config(make_config(state_symmetry=kinds), EnvSettings("block_picking"))
 
 
 def test_missing_inputs_are_named(observed):

@@ -94,8 +94,8 @@ def encoded(extension, image):
 def saved_replay(folder):
     frame = {"image": np.zeros(2, np.uint8)}
     replay = Replay(ReplayConfig(), frame, 2, [2, 2], folder)
-    replay.begin(0, frame)
-    replay.add(0, np.zeros(2, np.float32), 0.0, True, None)
+    replay.start_episode(0, frame)
+    replay.add_transition(0, np.zeros(2, np.float32), 0.0, True, None)
     replay.save(folder)
     return replay
 

@@ -78,9 +78,9 @@ def benchmark_rl(config: RlBenchmark) -> dict[str, float]:
         )
         with (
             Training(training_config, open_dataset(training_config.dataset)) as training,
-            Simulators(training.observed, config.num_simulators) as alone,
+            Simulators(training.simulator_config, config.num_simulators) as alone,
         ):
-            training.begin()
+            training.start()
             costs = _joint_steps(config, training, alone)
             samples = _samples(config, training.replay)
             total = training.seconds["total"]

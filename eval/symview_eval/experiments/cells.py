@@ -18,7 +18,7 @@ import torch
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.rl.checkpoints import last_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
-from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_symview.geometry.placement import CameraSpec

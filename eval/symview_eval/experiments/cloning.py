@@ -22,7 +22,7 @@ from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfi
 from lerobot_policy_symview.inputs.observation_codec import ObservationCodec
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.demonstrations import observations
-from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, simulator_config
 from lerobot_symview import keys
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Times
@@ -145,7 +145,7 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
     first_seed = EVALUATION_SEED + cell.seed * evaluations * scale.eval_episodes
     pending: list[tuple[int, float, Future[Evaluation]]] = []
     with (
-        Simulators(observed(config, env), scale.simulators) as simulators,
+        Simulators(simulator_config(config, env), scale.simulators) as simulators,
         Evaluator(simulators, scale.eval_episodes, first_seed, SymviewSacfdConfig.discount) as evaluator,
     ):
         metrics = _metrics(scale.batch_size)

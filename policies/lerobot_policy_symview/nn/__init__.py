@@ -1,1 +1,1 @@
-"""Equivariant layers, encoders and heads."""
+"""Networks: equivariant layers, encoders, heads and the critic."""

@@ -1,19 +1,22 @@
-"""Numba kernels of the convolution over D4 in the Fourier domain: from pixels to coefficients of irreps and back.
+"""Numba kernels of the D4 convolution in the Fourier domain: from pixels to coefficients of irreps and back.
 
-A field is 8 numbers per pixel, one per element of D4. Its transform over the elements is four sums with signs (the 1-d
-irreps, "lines"; line 2 a + m changes its sign with a quarter turn if a, with a mirroring if m) and a 2 x 2 matrix (the
-2-d irrep, "square", whose columns are vectors (x, y)). `expand` transforms every pixel and filters the coefficients
-with the six steerable functions; products of irreps are irreps again, so the results sort into 6 coefficients per line
-and 12 vectors. There the convolution is a matrix product per line, and one for both components of the vectors.
-`collect` transforms products back to pixels. `gather` and `spread` are the transposes of the two.
+A regular field is 8 numbers per pixel, one per element of D4. Its Fourier transform over the group has four
+coefficients of irreps of dimension 1 (signed sums; irrep 2 a + m changes sign under a quarter turn if a, under a
+reflection if m) and a 2 x 2 matrix of coefficients of the irrep of dimension 2, whose columns are vectors (x, y).
+`expand` transforms every pixel and filters the coefficients with the six steerable functions. Products of irreps
+decompose into irreps again, so that the results sort into 6 coefficients for each irrep of dimension 1 and 12 vectors
+for the irrep of dimension 2. There the convolution is one matrix product per irrep of dimension 1, and one for both
+components of the vectors. `collect` transforms the products back to pixels. `gather` and `spread` are the transposes of
+`expand` and `collect`.
 
-Pixels of a block, (row, column, image) with the image innermost, are the contiguous axis of every buffer. Strides
-between rows of buffers are constants and indices unsigned, else LLVM does not vectorise. Buffers are flat arrays:
+The pixels of a block, (row, column, image) with the image innermost, are the contiguous axis of every buffer. Strides
+between the rows of buffers are constants and indices are unsigned, else LLVM does not vectorise. Buffers are flat:
 
-    planes (8, PLANE): a block of one field with its border; a plane per element or coefficient
-    taps (9, PLANE): what a row of pixels adds to each of its neighbours
-    lines (fields, 6, 4, STRIDE), square (fields, 12, 2, STRIDE): what `expand` makes; of a scalar (4, 4) and (1, 2)
-    out_lines (fields, 4, STRIDE), out_square (fields, 2, 2, STRIDE): products, `square` column by column
+    planes (8, PLANE): a block of one field with its border; a plane per group element or coefficient
+    taps (9, PLANE): contributions of a row of pixels to each of its neighbours
+    dim1 (fields, 6, 4, STRIDE): coefficients of irreps of dimension 1 that `expand` writes; (4, 4) for a scalar
+    dim2 (fields, 12, 2, STRIDE): vectors of the irrep of dimension 2 that `expand` writes; (1, 2) for a scalar
+    out_dim1 (fields, 4, STRIDE), out_dim2 (fields, 2, 2, STRIDE): products, matrices column by column
 """
 
 from __future__ import annotations
@@ -24,26 +27,29 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-ORDER = 8
+ORDER = 8  # of D4
 PIXELS = 512  # of a block at most
-STRIDE = PIXELS + 16  # an odd number of cache lines, lest rows evict each other
+STRIDE = PIXELS + 16  # an odd number of cache lines, so that rows do not evict each other
 PLANE = 1040  # 512 pixels with their border, in rows of up to 256
-FASTMATH = {"reassoc", "contract", "nsz"}  # not nnan: what is not a number should be seen
+FASTMATH = {"reassoc", "contract", "nsz"}  # not nnan: NaN must propagate
 S, P, C, ONE, TWO = (np.uintp(k) for k in (STRIDE, PLANE, 4 * STRIDE, 1, 2))
 
 
 def compiled(function: Callable[..., None]) -> Callable[..., None]:
-    """Compile a kernel, and keep it on disk if there is a place that can be written to."""
+    """Compile a kernel; cache the machine code on disk if a writable folder exists."""
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": FASTMATH}
     try:
         return njit(function, cache=True, **options)
-    except RuntimeError:  # no such place
+    except RuntimeError:  # no writable folder
         return njit(function, **options)
 
 
 @njit(inline="always")
 def _analyse(values):  # type: ignore[no-untyped-def]
-    """Return the four lines, then the square row by row; a: turned elements, b: mirrored ones."""
+    """Return the Fourier transform over D4: four coefficients of dimension 1, then the 2 x 2 matrix row by row.
+
+    `values` has the four rotations (a) first, then the four reflections (b).
+    """
     a0, a1, a2, a3, b0, b1, b2, b3 = values
     p, q, r, s = a0 - a2, a1 - a3, b0 - b2, b1 - b3
     a, alternating_a = (a0 + a2) + (a1 + a3), (a0 + a2) - (a1 + a3)
@@ -77,7 +83,7 @@ def _put(planes, i, v):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _filter(planes, up, pitch, step, values):  # type: ignore[no-untyped-def]
-    """Return the six functions' values at the pixel whose upper left neighbour is `up`: even ones, then x and y."""
+    """Return the six steerable functions at the pixel whose upper left neighbour is `up`: four even ones, then x, y."""
     centre, edge, corner, axis, diagonal, cross, saddle = values
     here, down, far = up + pitch, up + pitch + pitch, step + step
     nw, n_, ne = planes[up], planes[up + step], planes[up + far]
@@ -91,7 +97,7 @@ def _filter(planes, up, pitch, step, values):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _vector(irrep, x, y):  # type: ignore[no-untyped-def]
-    """Return the product of a line with the vector (x, y), a vector."""
+    """Return the product of irrep `irrep` of dimension 1 with the vector (x, y), a vector."""
     first, second = (y, x) if irrep % 2 else (x, y)
     return first, -second if irrep == 1 or irrep == 2 else second
 
@@ -103,10 +109,10 @@ def _vector_transposed(irrep, first, second):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def expand(images, first, count, row, rows, padding, values, planes, lines, square):  # type: ignore[no-untyped-def]
-    """Transform and filter `rows` rows from `row` on, of `count` images from `first` on.
+def expand(images, first, count, row, rows, padding, values, planes, dim1, dim2):  # type: ignore[no-untyped-def]
+    """Transform and filter the rows `row` to `row + rows` of the images `first` to `first + count`.
 
-    Images are (B, 8, fields, H, W), or (B, 1, channels, H, W) if scalars, whose transform is the first line alone.
+    Images are (B, 8, fields, H, W), or (B, 1, channels, H, W) for scalars, which have the trivial irrep only.
     """
     elements, fields, height, width = images.shape[1:]
     step, columns = np.uintp(count), np.uintp(width + 2 * padding - 2)
@@ -128,45 +134,45 @@ def expand(images, first, count, row, rows, padding, values, planes, lines, squa
         for irrep in range(4):
             at, to = np.uintp(4 * functions * field + irrep) * S, np.uintp(2 * (vectors * field + even + irrep)) * S
             plane, cross, saddle = np.uintp(irrep) * P, np.uintp(irrep ^ 2) * P, np.uintp(irrep ^ 3) * P
-            for line in range(np.uintp(rows)):
+            for pixel_row in range(np.uintp(rows)):
                 for k in range(across):
-                    i, j = at + line * across + k, line * pitch + k
+                    i, j = at + pixel_row * across + k, pixel_row * pitch + k
                     v = _filter(planes, plane + j, pitch, step, values)
-                    lines[i], lines[i + C] = v[0], v[1]
-                    lines[i + C + C] = _filter(planes, cross + j, pitch, step, values)[2]
-                    lines[i + C + C + C] = _filter(planes, saddle + j, pitch, step, values)[3]
+                    dim1[i], dim1[i + C] = v[0], v[1]
+                    dim1[i + C + C] = _filter(planes, cross + j, pitch, step, values)[2]
+                    dim1[i + C + C + C] = _filter(planes, saddle + j, pitch, step, values)[3]
             if irrep == 0 or elements == ORDER:
-                for line in range(np.uintp(rows)):
+                for pixel_row in range(np.uintp(rows)):
                     for k in range(across):
-                        i = to + line * across + k
-                        v = _filter(planes, plane + line * pitch + k, pitch, step, values)
-                        square[i], square[i + S] = _vector(irrep, v[4], v[5])
+                        i = to + pixel_row * across + k
+                        v = _filter(planes, plane + pixel_row * pitch + k, pitch, step, values)
+                        dim2[i], dim2[i + S] = _vector(irrep, v[4], v[5])
         if elements == 1:
             continue
-        for column in range(2):  # of the square
+        for column in range(2):  # of the 2 x 2 matrix
             upper = np.uintp(4 + column) * P
             at, to = np.uintp(24 * field + 16 + 4 * column) * S, np.uintp(24 * field + 2 * column) * S
-            for line in range(np.uintp(rows)):
+            for pixel_row in range(np.uintp(rows)):
                 for k in range(across):
-                    i = line * across + k
-                    u = _filter(planes, upper + line * pitch + k, pitch, step, values)
-                    v = _filter(planes, upper + TWO * P + line * pitch + k, pitch, step, values)
-                    _put_square(square, to + i, (u[0], v[0], u[1], v[1], u[2], -v[2], v[3], u[3]))
+                    i = pixel_row * across + k
+                    u = _filter(planes, upper + pixel_row * pitch + k, pitch, step, values)
+                    v = _filter(planes, upper + TWO * P + pixel_row * pitch + k, pitch, step, values)
+                    _put_dim2(dim2, to + i, (u[0], v[0], u[1], v[1], u[2], -v[2], v[3], u[3]))
                     j = at + i
-                    lines[j], lines[j + TWO * S] = u[4] + v[5], u[4] - v[5]
-                    lines[j + S], lines[j + TWO * S + S] = v[4] - u[5], v[4] + u[5]
+                    dim1[j], dim1[j + TWO * S] = u[4] + v[5], u[4] - v[5]
+                    dim1[j + S], dim1[j + TWO * S + S] = v[4] - u[5], v[4] + u[5]
 
 
 @njit(inline="always")
-def _put_square(square, i, v):  # type: ignore[no-untyped-def]
+def _put_dim2(dim2, i, v):  # type: ignore[no-untyped-def]
     j = i + np.uintp(8) * S
-    square[i], square[i + S], square[i + np.uintp(4) * S], square[i + np.uintp(5) * S] = v[0], v[1], v[2], v[3]
-    square[j], square[j + S], square[j + np.uintp(4) * S], square[j + np.uintp(5) * S] = v[4], v[5], v[6], v[7]
+    dim2[i], dim2[i + S], dim2[i + np.uintp(4) * S], dim2[i + np.uintp(5) * S] = v[0], v[1], v[2], v[3]
+    dim2[j], dim2[j + S], dim2[j + np.uintp(4) * S], dim2[j + np.uintp(5) * S] = v[4], v[5], v[6], v[7]
 
 
 @njit(inline="always")
 def _tap(taps, i, step, values, v):  # type: ignore[no-untyped-def]
-    """Write what a pixel adds to its neighbours: the transpose of `_filter`."""
+    """Write a pixel's contributions to its neighbours: the transpose of `_filter`."""
     centre, edge, corner, axis, diagonal, cross, saddle = values
     edges, corners, even, odd = edge * v[1], corner * v[1], cross * v[2], saddle * v[3]
     x, y, x_diagonal, y_diagonal = axis * v[4], axis * v[5], diagonal * v[4], diagonal * v[5]
@@ -188,47 +194,47 @@ def _add_taps(taps, planes, up, pitch):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def gather(lines, square, first, count, row, rows, padding, values, taps, planes, images):  # type: ignore[no-untyped-def]
-    """Add to `images` (B, 8, fields, H, W) the transpose of `expand`."""
+def gather(dim1, dim2, first, count, row, rows, padding, values, taps, planes, images):  # type: ignore[no-untyped-def]
+    """Add the transpose of `expand`, applied to `dim1` and `dim2`, to `images` (B, 8, fields, H, W)."""
     _, elements, fields, height, width = images.shape
     step, columns = np.uintp(count), np.uintp(width + 2 * padding - 2)
     across, pitch = columns * step, (columns + TWO) * step
     used = np.uintp(rows + 2) * pitch
-    taps[:] = 0  # what lies beside a row stays 0
+    taps[:] = 0  # the border beside a row stays 0
     for field in range(fields):
         planes[:] = 0
         for irrep in range(4):
-            first_line, vector = np.uintp(24 * field) * S, np.uintp(24 * field + 16 + 2 * irrep) * S
-            centre, cross = first_line + np.uintp(irrep) * S, first_line + C + C + np.uintp(irrep ^ 2) * S
-            saddle = first_line + C + C + C + np.uintp(irrep ^ 3) * S
-            for line in range(np.uintp(rows)):
+            dim1_start, vector = np.uintp(24 * field) * S, np.uintp(24 * field + 16 + 2 * irrep) * S
+            centre, cross = dim1_start + np.uintp(irrep) * S, dim1_start + C + C + np.uintp(irrep ^ 2) * S
+            saddle = dim1_start + C + C + C + np.uintp(irrep ^ 3) * S
+            for pixel_row in range(np.uintp(rows)):
                 for k in range(across):
-                    i = line * across + k
-                    x, y = _vector_transposed(irrep, square[vector + i], square[vector + i + S])
+                    i = pixel_row * across + k
+                    x, y = _vector_transposed(irrep, dim2[vector + i], dim2[vector + i + S])
                     _tap(
                         taps,
                         k,
                         step,
                         values,
-                        (lines[centre + i], lines[centre + i + C], lines[cross + i], lines[saddle + i], x, y),
+                        (dim1[centre + i], dim1[centre + i + C], dim1[cross + i], dim1[saddle + i], x, y),
                     )
-                _add_taps(taps, planes, np.uintp(irrep) * P + line * pitch, pitch)
+                _add_taps(taps, planes, np.uintp(irrep) * P + pixel_row * pitch, pitch)
         for column in range(2):
             upper = np.uintp(4 + column) * P
             at, to = np.uintp(24 * field + 16 + 4 * column) * S, np.uintp(24 * field + 2 * column) * S
-            for line in range(np.uintp(rows)):
+            for pixel_row in range(np.uintp(rows)):
                 for k in range(across):
-                    i, j = at + line * across + k, to + line * across + k
-                    x, y = lines[i] + lines[i + TWO * S], lines[i + TWO * S + S] - lines[i + S]
-                    even = square[j], square[j + np.uintp(4) * S], square[j + np.uintp(8) * S]
-                    _tap(taps, k, step, values, even + (square[j + np.uintp(13) * S], x, y))
-                _add_taps(taps, planes, upper + line * pitch, pitch)
+                    i, j = at + pixel_row * across + k, to + pixel_row * across + k
+                    x, y = dim1[i] + dim1[i + TWO * S], dim1[i + TWO * S + S] - dim1[i + S]
+                    even = dim2[j], dim2[j + np.uintp(4) * S], dim2[j + np.uintp(8) * S]
+                    _tap(taps, k, step, values, even + (dim2[j + np.uintp(13) * S], x, y))
+                _add_taps(taps, planes, upper + pixel_row * pitch, pitch)
                 for k in range(across):
-                    i, j = at + line * across + k, to + line * across + k + S
-                    x, y = lines[i + S] + lines[i + TWO * S + S], lines[i] - lines[i + TWO * S]
-                    even = square[j], square[j + np.uintp(4) * S], -square[j + np.uintp(8) * S]
-                    _tap(taps, k, step, values, even + (square[j + np.uintp(11) * S], x, y))
-                _add_taps(taps, planes, upper + TWO * P + line * pitch, pitch)
+                    i, j = at + pixel_row * across + k, to + pixel_row * across + k + S
+                    x, y = dim1[i + S] + dim1[i + TWO * S + S], dim1[i] - dim1[i + TWO * S]
+                    even = dim2[j], dim2[j + np.uintp(4) * S], -dim2[j + np.uintp(8) * S]
+                    _tap(taps, k, step, values, even + (dim2[j + np.uintp(11) * S], x, y))
+                _add_taps(taps, planes, upper + TWO * P + pixel_row * pitch, pitch)
         for pixel in range(used):
             _put(planes, pixel, _synthesise(_get(planes, pixel)))
         for image in range(count):
@@ -241,18 +247,18 @@ def gather(lines, square, first, count, row, rows, padding, values, taps, planes
 
 
 @compiled
-def collect(out_lines, out_square, bias, first, count, row, rows, columns, planes, pool, out, chosen):  # type: ignore[no-untyped-def]
-    """Transform products (see `expand` for the block) into pixels of `out` (B, 8, fields, H', W').
+def collect(out_dim1, out_dim2, bias, first, count, row, rows, columns, planes, pool, out, chosen):  # type: ignore[no-untyped-def]
+    """Transform products of a block (see `expand`) into pixels of `out` (B, 8, fields, H', W').
 
-    If `pool`, they are the maxima of 2 x 2 pixels, or 0; `chosen` (uint8, the same shape) says which: 4 is none.
+    If `pool`, apply 2 x 2 max pooling and ReLU; `chosen` (uint8, same shape) gets the index of the maximum, 4 for none.
     """
     step, used = np.uintp(count), np.uintp(rows * columns * count)
     for field in range(len(bias)):
         at = np.uintp(4 * field) * S
         for pixel in range(used):
             j = at + pixel
-            d = out_lines[j], out_lines[j + S], out_lines[j + TWO * S], out_lines[j + TWO * S + S]
-            e = out_square[j], out_square[j + TWO * S], out_square[j + S], out_square[j + TWO * S + S]
+            d = out_dim1[j], out_dim1[j + S], out_dim1[j + TWO * S], out_dim1[j + TWO * S + S]
+            e = out_dim2[j], out_dim2[j + TWO * S], out_dim2[j + S], out_dim2[j + TWO * S + S]
             _put(planes, pixel, _synthesise((d[0] + bias[field], d[1], d[2], d[3], *e)))
         for image in range(count):
             for element in range(ORDER):
@@ -294,8 +300,8 @@ def _unpool(gradient, chosen, left, planes, at, step):  # type: ignore[no-untype
 
 
 @compiled
-def spread(gradient, chosen, pool, first, count, row, rows, columns, planes, out_lines, out_square):  # type: ignore[no-untyped-def]
-    """Write the transpose of `collect`."""
+def spread(gradient, chosen, pool, first, count, row, rows, columns, planes, out_dim1, out_dim2):  # type: ignore[no-untyped-def]
+    """Write the transpose of `collect`, applied to `gradient`, to `out_dim1` and `out_dim2`."""
     step, used = np.uintp(count), np.uintp(rows * columns * count)
     for field in range(gradient.shape[2]):
         for image in range(count):
@@ -317,6 +323,6 @@ def spread(gradient, chosen, pool, first, count, row, rows, columns, planes, out
         at = np.uintp(4 * field) * S
         for pixel in range(used):
             j, v = at + pixel, _analyse(_get(planes, pixel))
-            out_lines[j], out_lines[j + S], out_lines[j + TWO * S], out_lines[j + TWO * S + S] = v[0], v[1], v[2], v[3]
-            out_square[j], out_square[j + TWO * S] = v[4], v[5]
-            out_square[j + S], out_square[j + TWO * S + S] = v[6], v[7]
+            out_dim1[j], out_dim1[j + S], out_dim1[j + TWO * S], out_dim1[j + TWO * S + S] = v[0], v[1], v[2], v[3]
+            out_dim2[j], out_dim2[j + TWO * S] = v[4], v[5]
+            out_dim2[j + S], out_dim2[j + TWO * S + S] = v[6], v[7]

@@ -1,8 +1,8 @@
-"""Group-equivariant layers whose filters are expanded from free weights and handed to ordinary convolutions.
+"""Group-equivariant layers: filters are expanded from free weights and passed to ordinary convolutions.
 
-Features are `fields`: one number per element of the group, as G blocks of n channels, the group outermost. When the
-scene is transformed by g, block h becomes block g^-1 h. Filters obey the kernel constraint of Cohen et al. (2019) by
-construction: the filter of output block g is the one of the identity, transformed by g.
+Features are n regular fields: one number per field and group element, stored as G blocks of n channels with the group
+axis outermost. When the scene is transformed by g, block h becomes block g^-1 h. Filters satisfy the kernel constraint
+of Cohen et al. (2019) by construction: the filter of output block g is the identity's filter, transformed by g.
 """
 
 from __future__ import annotations
@@ -19,50 +19,56 @@ from torch.nn import functional
 
 from lerobot_policy_symview.symmetry.groups import DECIMALS, PlanarGroup
 
-RING_WIDTH = 0.4  # pixels; that of escnn's filters of 3 x 3, so that ours are the same functions
-FREQUENCIES = 2  # of the ring's angular functions: a square of 3 x 3 pixels holds no more without aliasing
-TAPS = 9
+RING_WIDTH = 0.4  # pixels; as in escnn's 3 x 3 filters, so that both span the same functions
+FREQUENCIES = 2  # highest angular frequency of the ring; 3 x 3 pixels hold no more without aliasing
+TAPS = 9  # pixels of a 3 x 3 filter
 
 
 def steerable_basis(group: PlanarGroup) -> NDArray[np.float64]:
-    """Return the functions that filters of 3 x 3 pixels are sums of, moved by every element: (G, 6, 9), orthonormal.
+    """Return the orthonormal basis of steerable 3 x 3 filters, transformed by every group element: (G, 6, 9).
 
-    The six are the centre pixel and a ring of radius 1 times cos and sin of 0, 1 and 2 times the angle. Function b of
-    element g is b(g^-1 x); pixel x is (row, column) = (x, y) of the table.
+    The six functions are the centre pixel and a ring of radius 1 times cos and sin of 0, 1 and 2 times the angle. For
+    element g, function b is b(g^-1 x); pixel x is (row, column), along the table's (x, y).
     """
-    moved = _moved_taps(group)
-    radius, angle = np.hypot(moved[..., 0], moved[..., 1]), np.arctan2(moved[..., 1], moved[..., 0])
+    taps = _transformed_taps(group)
+    radius, angle = np.hypot(taps[..., 0], taps[..., 1]), np.arctan2(taps[..., 1], taps[..., 0])
     ring = np.where(radius > 0.5, np.exp(-0.5 * ((radius - 1) / RING_WIDTH) ** 2), 0.0)
     waves = [np.cos(k * angle) for k in range(FREQUENCIES + 1)]
     waves += [np.sin(k * angle) for k in range(1, FREQUENCIES + 1)]
     functions = np.stack([(radius < 0.5).astype(float), *(ring * wave for wave in waves)], axis=1)
-    norms = np.linalg.norm(functions[0], axis=-1)  # one norm for all elements: 45 degrees off the grid sums differ
+    norms = np.linalg.norm(functions[0], axis=-1)  # the identity's for all elements: off the grid, norms would differ
     return (functions / norms[:, None]).round(DECIMALS) + 0.0
 
 
 def pixel_basis(group: PlanarGroup) -> NDArray[np.float64]:
-    """Return single pixels, moved by every element: (G, 9, 9). Filters may then be anything, as in plain networks."""
+    """Return the basis of single pixels, transformed by every group element: (G, 9, 9). Filters are unconstrained.
+
+    Raises:
+        ValueError: if a group element does not map pixels to pixels.
+    """
     if not group.is_exact:
-        raise ValueError(f"pixels cannot be turned by {360 / group.turns:g} degrees")
-    row, column = np.moveaxis(_moved_taps(group).round().astype(int) + 1, -1, 0)
+        raise ValueError(
+            f"filters of single pixels cannot be rotated by {360 / group.turns:g} degrees: use a group of quarter turns"
+        )
+    row, column = np.moveaxis(_transformed_taps(group).round().astype(int) + 1, -1, 0)
     return np.eye(TAPS)[:, 3 * row + column].transpose(1, 0, 2)
 
 
-def _moved_taps(group: PlanarGroup) -> NDArray[np.float64]:
-    """Return g^-1 x for every element g and pixel x of a filter: (G, 9, 2)."""
+def _transformed_taps(group: PlanarGroup) -> NDArray[np.float64]:
+    """Return g^-1 x for every group element g and filter pixel x: (G, 9, 2)."""
     taps = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], indexing="ij"), axis=-1).reshape(TAPS, 2)
     return np.einsum("gij,ti->gtj", group.rotation(), taps)  # the inverse of an orthogonal matrix is its transpose
 
 
 class FieldLayer(nn.Module):
-    """What equivariant layers share: free weights per pair of fields, arranged into one filter per output block.
+    """Base of the equivariant layers: it expands free weights per pair of fields into one filter per output block.
 
     Args:
         group: G elements.
-        inputs: number of input fields, or (G, d, d) the representation of d input channels that are not fields.
-        fields: output fields n.
-        basis: (G, functions, taps), how each element moves the functions that filters are sums of.
-        layers: stacked taps that no element moves: pixels along the vertical.
+        inputs: number of regular input fields, or the representation (G, d, d) of d input channels.
+        fields: n, number of regular output fields.
+        basis: (G, functions, taps), basis of the filters, transformed by every group element.
+        depth: size of the filters along the vertical axis, on which the group acts trivially.
     """
 
     basis: Tensor
@@ -74,10 +80,10 @@ class FieldLayer(nn.Module):
         inputs: int | NDArray[np.float64],
         fields: int,
         basis: NDArray[np.float64],
-        layers: int = 1,
+        depth: int = 1,
     ):
         super().__init__()
-        self.group, self.fields, self.layers = group, fields, layers
+        self.group, self.fields, self.depth = group, fields, depth
         self.has_field_inputs = isinstance(inputs, int)
         dtype = torch.get_default_dtype()
         self.register_buffer("basis", torch.tensor(basis, dtype=dtype), persistent=False)
@@ -86,60 +92,60 @@ class FieldLayer(nn.Module):
         self.register_buffer(
             "arrangement", arrangement if self.has_field_inputs else arrangement.to(dtype), persistent=False
         )
-        free = channels * layers * basis.shape[1]
-        self.weight = nn.Parameter(torch.empty(fields, channels, layers * basis.shape[1]))
-        nn.init.normal_(self.weight, std=math.sqrt(2 / free))  # He et al. (2015): the basis is orthonormal
+        fan_in = channels * depth * basis.shape[1]
+        self.weight = nn.Parameter(torch.empty(fields, channels, depth * basis.shape[1]))
+        nn.init.normal_(self.weight, std=math.sqrt(2 / fan_in))  # He et al. (2015); the basis is orthonormal
         self.bias = nn.Parameter(torch.zeros(fields))
-        self._kept: tuple[Any, tuple[Tensor, ...]] | None = None
+        self._cache: tuple[Any, tuple[Tensor, ...]] | None = None
 
     def train(self, mode: bool = True) -> Self:
-        """Switch between training and evaluation, which forgets what was kept."""
+        """Switch between training and evaluation mode, and clear the cache."""
         if mode != self.training:
-            self._kept = None
+            self._cache = None
         return super().train(mode)
 
     def expanded(self) -> tuple[Tensor, ...]:
-        """Return ordinary weights (G fields, channels, layers, taps) and biases (G fields,)."""
-        return self.kept(self._expand)
+        """Return ordinary filters (G fields, channels, depth, taps) and biases (G fields,)."""
+        return self.cached(self._expand)
 
-    def kept(self, compute: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
-        """Return what is computed from the weights; without gradients it is kept until these change.
+    def cached(self, compute: Callable[[], tuple[Tensor, ...]]) -> tuple[Tensor, ...]:
+        """Return `compute()`, a function of the weights; without gradients the result is cached until they change.
 
-        PyTorch does not count changes through `parameter.data`: they are seen after the next switch between `train()`
-        and `eval()`.
+        PyTorch counts no version for changes through `parameter.data`: they take effect after the next switch between
+        `train()` and `eval()`.
         """
         if torch.is_grad_enabled():
-            self._kept = None
+            self._cache = None
             return compute()
         versions = [(parameter._version, parameter.data_ptr()) for parameter in self.parameters()]
         state = (compute.__name__, versions, autocast_dtype(self.weight))
-        if self._kept is None or self._kept[0] != state:
-            self._kept = (state, compute())
-        return self._kept[1]
+        if self._cache is None or self._cache[0] != state:
+            self._cache = (state, compute())
+        return self._cache[1]
 
     def _expand(self) -> tuple[Tensor, Tensor]:
         dtype = autocast_dtype(self.weight)
         size, functions, taps = self.basis.shape
-        weight = self.weight.to(dtype).view(self.fields, -1, self.layers, functions)
+        weight = self.weight.to(dtype).view(self.fields, -1, self.depth, functions)
         if self.has_field_inputs:
-            blocks = weight.view(self.fields, size, -1, self.layers, functions)
-            # blocks[:, self.arrangement], but that sums its gradient in any order
+            blocks = weight.view(self.fields, size, -1, self.depth, functions)
+            # not blocks[:, self.arrangement], whose backward pass adds gradients in an unspecified order
             chosen = blocks.index_select(1, self.arrangement.flatten()).view(self.fields, size, *blocks.shape[1:])
-            # (fields, G out, G in, inputs, ...), then the output's element first
+            # (fields, G out, G in, inputs, ...) to (G out, fields, G in inputs, ...)
             arranged = chosen.transpose(0, 1).flatten(2, 3)
         else:
             arranged = torch.einsum("oblf,gab->goalf", weight, self.arrangement.to(dtype))
         filters = torch.bmm(arranged.reshape(size, -1, functions), self.basis.to(dtype))
-        weights = filters.view(size * self.fields, weight.shape[1], self.layers, taps)
-        return self.gain(weights), self.bias.to(dtype).repeat(size)
+        weights = filters.view(size * self.fields, weight.shape[1], self.depth, taps)
+        return self.scale_filters(weights), self.bias.to(dtype).repeat(size)
 
-    def gain(self, weights: Tensor) -> Tensor:
-        """Return what becomes of expanded weights; nothing, if the layer is to be equivariant."""
-        return weights
+    def scale_filters(self, filters: Tensor) -> Tensor:
+        """Return the filters to use for expanded ones; equivariant layers keep them unchanged."""
+        return filters
 
 
 class FieldConv2d(FieldLayer):
-    """Equivariant convolution of 3 x 3 pixels; `full` filters are of all nine, others of `steerable_basis`."""
+    """Equivariant 3 x 3 convolution with filters of `steerable_basis` or, if `full`, of `pixel_basis`."""
 
     def __init__(
         self,
@@ -153,34 +159,34 @@ class FieldConv2d(FieldLayer):
         self.padding = padding
 
     def forward(self, images: Tensor, pool: bool = False) -> Tensor:
-        """Map (B, channels, H, W) to (B, G fields, H', W'); `pool` appends the maximum of 2 x 2 pixels and ReLU."""
+        """Map (B, channels, H, W) to (B, G fields, H', W'); `pool` appends 2 x 2 max pooling and ReLU."""
         weight, bias = self.expanded()
         result = functional.conv2d(images, weight.view(*weight.shape[:2], 3, 3), bias, padding=self.padding)
         return functional.relu(functional.max_pool2d(result, 2)) if pool else result
 
 
 class RelaxedConv2d(FieldConv2d):
-    """Relaxed group convolution (Wang et al., 2022e) with one filter bank: every output block has a learned gain.
+    """Relaxed group convolution (Wang et al., 2022e) with one filter bank and a learned gain per output block.
 
-    It is equivariant while all gains are equal, as they are at the start.
+    It is equivariant while all gains are equal, as at initialisation.
     """
 
     def __init__(self, group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, padding: int):
         super().__init__(group, inputs, fields, padding, full=True)
         self.gains = nn.Parameter(torch.ones(group.size))
 
-    def gain(self, weights: Tensor) -> Tensor:
-        """Scale each output block by its gain."""
-        return weights * self.gains.to(weights.dtype).repeat_interleave(self.fields)[:, None, None, None]
+    def scale_filters(self, filters: Tensor) -> Tensor:
+        """Multiply the filters of each output block by its gain."""
+        return filters * self.gains.to(filters.dtype).repeat_interleave(self.fields)[:, None, None, None]
 
     def asymmetry(self) -> Tensor:
-        """Return the sum of the differences between gains, which training keeps small."""
+        """Return the sum of absolute differences between all pairs of gains, the relaxation penalty."""
         first, second = torch.triu_indices(len(self.gains), len(self.gains), 1, device=self.gains.device).unbind()
         return (self.gains[first] - self.gains[second]).abs().sum()
 
 
 class FieldConv3d(FieldLayer):
-    """Equivariant convolution of `layers` x 3 x 3 voxels, z first; the group moves the last two axes only."""
+    """Equivariant `depth` x 3 x 3 convolution of voxel grids, z first; the group acts on the last two axes."""
 
     def __init__(
         self,
@@ -188,36 +194,36 @@ class FieldConv3d(FieldLayer):
         inputs: int | NDArray[np.float64],
         fields: int,
         padding: tuple[int, int, int],
-        layers: int = 3,
+        depth: int = 3,
     ):
-        super().__init__(group, inputs, fields, pixel_basis(group), layers)
+        super().__init__(group, inputs, fields, pixel_basis(group), depth)
         self.padding = padding
 
     def forward(self, voxels: Tensor, pool: bool = False) -> Tensor:
-        """Map (B, channels, Z, H, W) to (B, G fields, Z', H', W'); `pool` as in two dimensions, with 2 x 2 x 2."""
+        """Map (B, channels, Z, H, W) to (B, G fields, Z', H', W'); `pool` appends 2 x 2 x 2 max pooling and ReLU."""
         weight, bias = self.expanded()
         result = functional.conv3d(voxels, weight.view(*weight.shape[:3], 3, 3), bias, padding=self.padding)
         return functional.relu(functional.max_pool3d(result, 2)) if pool else result
 
 
 class FieldLinear(FieldLayer):
-    """Equivariant linear map of the last axis: (..., channels) to (..., G fields)."""
+    """Equivariant linear layer on the last axis."""
 
     def __init__(self, group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int):
         super().__init__(group, inputs, fields, np.ones((group.size, 1, 1)))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Apply the map."""
+        """Map (..., channels) to (..., G fields)."""
         weight, bias = self.expanded()
         return functional.linear(features, weight.flatten(1), bias)
 
 
 def asymmetry(network: nn.Module) -> Tensor:
-    """Return how far the relaxed layers of a network are from equivariance."""
+    """Return the relaxation penalty of a network: the sum of `RelaxedConv2d.asymmetry` over its layers."""
     return torch.stack([layer.asymmetry() for layer in network.modules() if isinstance(layer, RelaxedConv2d)]).sum()
 
 
 def autocast_dtype(tensor: Tensor) -> torch.dtype:
-    """Return the type that convolutions of `tensor` are computed in."""
+    """Return the dtype in which convolutions with `tensor` are computed, under autocast or not."""
     kind = tensor.device.type
     return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else tensor.dtype

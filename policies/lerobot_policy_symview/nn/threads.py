@@ -1,4 +1,4 @@
-"""Work shared among threads that run compiled code, each with buffers of its own."""
+"""A thread pool for compiled code that releases the GIL; every thread has its own buffers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import lru_cache
 
 import torch
 
-_callers: set[int] = set()  # threads that have work done in threads
+_callers: set[int] = set()  # identifiers of the threads that are inside `in_threads`
 
 
 @lru_cache
@@ -18,21 +18,22 @@ def _workers(count: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, "symview")
 
 
-def _forget() -> None:
-    """Threads do not survive a fork."""
+def _reset_after_fork() -> None:
+    """Drop the pools, whose threads do not survive a fork."""
     _workers.cache_clear()
     _callers.clear()
 
 
-os.register_at_fork(after_in_child=_forget)
+os.register_at_fork(after_in_child=_reset_after_fork)
 
 
 def in_threads[State, Task](
     work: Callable[[State, Task], None], tasks: Sequence[Task], make: Callable[[], State]
 ) -> list[State]:
-    """Call `work(state, task)` for every task, in as many threads as torch uses; return each thread's `make()`.
+    """Call `work(state, task)` for every task, in as many threads as torch uses; return the threads' states.
 
-    Which thread has which task follows from their numbers alone, so that what a thread sums up is the same every time.
+    Each thread's state comes from `make()`. The assignment of tasks to threads depends on their number alone, so that
+    sums in the states are bit-identical from run to run.
     """
     threads = torch.get_num_threads()
     count = max(1, min(threads, len(tasks)))
@@ -45,7 +46,7 @@ def in_threads[State, Task](
             return state
 
     def run_alone(thread: int) -> State:
-        torch.set_num_threads(1)  # and MKL's, which is the process's: products would start threads in threads
+        torch.set_num_threads(1)  # also sets MKL's count, which is the process's: otherwise threads would nest
         return run(thread)
 
     if count == 1:

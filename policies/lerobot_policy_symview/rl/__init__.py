@@ -1,1 +1,1 @@
-"""Training `symview_sacfd`: replay, updates, and `symview-train-rl`, which runs them beside simulators."""
+"""Reinforcement learning of `symview_sacfd`: replay buffer, learner, rollouts, and the command `symview-train-rl`."""

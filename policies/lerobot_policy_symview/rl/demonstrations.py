@@ -1,4 +1,4 @@
-"""Demonstrations of a LeRobot dataset as transitions."""
+"""Reads demonstrations for reinforcement learning from a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def open_dataset(target: DatasetLocation) -> Any:
 
 
 def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
-    """Compare what a dataset says about its task, robot and camera with what is to be simulated.
+    """Check that a dataset's task, robot and camera are those to simulate.
 
     Raises:
-        ValueError: naming the flags that differ.
+        ValueError: if not; the message lists the flags that differ.
     """
     simulated = {spec.name: spec for spec in env.all_cameras}
     if camera not in simulated:
@@ -59,32 +59,35 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
         if name in recorded.get("placement", {}):
             pairs[f"--env.camera.{name}"] = (value, recorded["placement"][name])
     differing = [
-        f"{flag} is {ours!r}, theirs is {theirs!r}" for flag, (ours, theirs) in pairs.items() if ours != theirs
+        f"{flag} is {ours!r}, the dataset has {theirs!r}" for flag, (ours, theirs) in pairs.items() if ours != theirs
     ]
     if differing:
-        raise ValueError(f"the demonstrations are of another scene: {'; '.join(differing)}")
+        raise ValueError(f"the demonstrations were recorded in a different scene: {'; '.join(differing)}")
 
 
 def observations(dataset: Any) -> Iterator[tuple[dict[str, Tensor], Tensor]]:
-    """Yield batches of what was observed, as an environment would deliver it, and the actions (B, A)."""
+    """Yield batches of observations, in the format of an environment's, and of actions (B, A)."""
     for batch in DataLoader(dataset, batch_size=BATCH):
         yield {name: value for name, value in batch.items() if name.startswith("observation.")}, batch[keys.ACTION]
 
 
-def outcomes(dataset: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return for every frame its reward, whether its episode ends there, and whether that is by success.
+def rewards_and_ends(dataset: Any) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return, for every frame, its reward, whether its episode ends there, and whether it ends there with success.
 
-    A dataset that does not say is taken for one of successes, with a reward of 1 at the end of every episode.
+    A dataset without `next.reward` gets a reward of 1 at the end of every episode; in one without `next.success`, every
+    episode is a success.
     """
     table = dataset.hf_dataset.with_format("numpy")
     ends = np.append(np.diff(table["episode_index"][:]) != 0, True)
-    stated = {name: np.asarray(table[name][:]).reshape(-1) for name in (REWARD, SUCCESS) if name in table.column_names}
-    reward = stated.get(REWARD, ends).astype(np.float32)
-    return reward, ends, ends & stated.get(SUCCESS, ends).astype(bool)
+    recorded = {
+        name: np.asarray(table[name][:]).reshape(-1) for name in (REWARD, SUCCESS) if name in table.column_names
+    }
+    reward = recorded.get(REWARD, ends).astype(np.float32)
+    return reward, ends, ends & recorded.get(SUCCESS, ends).astype(bool)
 
 
 def ranges(dataset: Any, action_limits: tuple[NDArray, NDArray]) -> dict[str, dict[str, Tensor]]:
-    """Return the ranges that scale states, the dataset's, and actions, the environment's."""
+    """Return the ranges for scaling: the dataset's of the states, the environment's limits of the actions."""
     states = dataset.meta.stats[keys.STATE]
     return {
         keys.STATE: {name: torch.as_tensor(states[name]) for name in ("min", "max")},

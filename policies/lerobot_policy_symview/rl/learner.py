@@ -21,11 +21,14 @@ from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.rl.replay import Sample
 
 WEIGHTS = "learner.safetensors"
-MEASURES = ("critic_loss", "actor_loss", "expert_loss", "value", "entropy", "temperature")
+METRICS = ("critic_loss", "actor_loss", "bc_loss", "q_value", "entropy", "temperature")
+
+NetworkInput = tuple[Tensor, Tensor]
+"""Observation and state (B, D), as the encoders take them."""
 
 
 class Learner(nn.Module):
-    """An actor, which is the policy, its critic, the critic's slow copy, the temperature, and what optimises them.
+    """Actor, critic, target critic and temperature, with one Adam optimiser for each of the trained three.
 
     Args:
         policy: the actor.
@@ -50,85 +53,88 @@ class Learner(nn.Module):
     def update(self, sample: Sample) -> tuple[NDArray[np.float32], dict[str, Tensor]]:
         """Take one step with every optimiser.
 
-        The critic's convolutions see each observation once: the actor is judged by the features, and by the critic, of
-        before the step.
+        The critic encodes each observation once: the actor's loss reads the features, detached, and the Q-functions
+        from before the critic's step.
 
         Returns:
-            The errors of the estimated values (B,), for priorities, and the scalars `MEASURES` for the log.
+            The absolute TD errors (B,), averaged over the two Q-functions, and the scalar `METRICS`.
         """
         self.policy.train()
         device = self.log_temperature.device
-        seen, action = self._seen(sample)
+        observation, next_observation, action = self.augment(sample)
         reward, weight = sample.reward.to(device), sample.weight.to(device)
-        goes_on, expert = (~sample.terminal).float().to(device), sample.expert.float().to(device)
+        not_done, is_demo = (~sample.terminal).float().to(device), sample.is_demo.float().to(device)
         temperature = self.log_temperature.exp().detach()
-        (picture, state), following = seen
 
         with torch.no_grad(), self.policy.precision():
-            next_action, next_log_density = self.policy.draw(*following)
-            next_values = self.target.values(self.target.encoder(*following), next_action)
-            worth = next_values.amin(dim=1) - temperature * next_log_density
-            goal = reward + self.config.discount * goes_on * worth
+            next_action, next_log_prob = self.policy.sample_action(*next_observation)
+            next_q = self.target.q_functions(self.target.encoder(*next_observation), next_action)
+            next_value = next_q.amin(dim=1) - temperature * next_log_prob
+            td_target = reward + self.config.discount * not_done * next_value
 
         with self.policy.precision():
-            features = self.critic.encoder(picture, state)
-            values = self.critic.values(features, action)
-            drawn, log_density = self.policy.draw(picture, state)
-            judged = self.critic.values(features.detach(), drawn).amin(dim=1)
-        errors = values - goal[:, None]
-        critic_loss = (weight[:, None] * errors**2).mean(dim=0).sum()
-        difference = functional.mse_loss(drawn, action, reduction="none").mean(dim=1)
-        expert_loss = (expert * difference).sum() / expert.sum().clamp(min=1)
-        actor_loss = (temperature * log_density - judged).mean() + self.config.expert_weight * expert_loss
-        temperature_loss = -self.log_temperature * (log_density.detach().mean() + self.config.entropy)
+            features = self.critic.encoder(*observation)
+            q = self.critic.q_functions(features, action)
+            pi, log_pi = self.policy.sample_action(*observation)
+            q_pi = self.critic.q_functions(features.detach(), pi).amin(dim=1)
+        td_error = q - td_target[:, None]
+        critic_loss = (weight[:, None] * td_error**2).mean(dim=0).sum()
+        bc_error = functional.mse_loss(pi, action, reduction="none").mean(dim=1)
+        bc_loss = (is_demo * bc_error).sum() / is_demo.sum().clamp(min=1)
+        actor_loss = (temperature * log_pi - q_pi).mean() + self.config.bc_weight * bc_loss
+        temperature_loss = -self.log_temperature * (log_pi.detach().mean() + self.config.entropy_target)
         if self.config.encoder == "relaxed":
             critic_loss = critic_loss + self.config.relaxation_weight * asymmetry(self.critic)
             actor_loss = actor_loss + self.config.relaxation_weight * asymmetry(self.policy.network)
-        # The actor's first: it leaves gradients in the critic's last layers, which the critic's own must not meet.
+        # The actor first: its loss leaves gradients in the Q-functions, which the critic's zero_grad removes.
         for name, loss in (("actor", actor_loss), ("critic", critic_loss), ("temperature", temperature_loss)):
             self.optimizers[name].zero_grad()
             loss.backward()
         for optimizer in self.optimizers.values():
             optimizer.step()
-        self._follow()
+        self._update_target()
         self.policy.update()
-        measures = (critic_loss, actor_loss, expert_loss, values.mean(), -log_density.mean(), temperature)
-        told = {name: value.detach() for name, value in zip(MEASURES, measures, strict=True)}
-        return errors.detach().abs().mean(dim=1).cpu().numpy(), told
+        values = (critic_loss, actor_loss, bc_loss, q.mean(), -log_pi.mean(), temperature)
+        metrics = {name: value.detach() for name, value in zip(METRICS, values, strict=True)}
+        return td_error.detach().abs().mean(dim=1).cpu().numpy(), metrics
+
+    def augment(self, sample: Sample) -> tuple[NetworkInput, NetworkInput, Tensor]:
+        """Return the network's input before and after the actions, and the actions (B, A).
+
+        Each transition gets one random planar transform and one random crop offset, the same before and after.
+        """
+        device = self.log_temperature.device
+        frames = self.codec.unpack(sample.frames, device)
+        action = sample.action.to(device)
+        transform = self.policy.random_transform(action)
+        crop_offset = torch.rand(len(action), 2, device=device).repeat(2, 1)
+        if transform is not None:
+            action = self.config.actions.transform(action, transform, absolute_yaw=False).clamp(-1, 1)
+            transform = transform.repeated(2)
+        observation, state = self.policy.network_input(frames, transform, crop_offset)
+        before, after = zip(observation.chunk(2), state.chunk(2), strict=True)
+        return before, after, action
 
     def save(self, folder: Path) -> None:
-        """Write everything but the actor, which is the policy's to save."""
+        """Write critic, target critic, temperature and optimisers; the policy saves the actor."""
         state = {name: value for name, value in self.state_dict().items() if not name.startswith("policy.")}
         save_file({name: value.contiguous() for name, value in state.items()}, folder / WEIGHTS)
         save_optimizer_state(self.optimizers, folder)
 
     def load(self, folder: Path) -> None:
-        """Take over what `save` wrote, beside an actor that was loaded."""
+        """Load what `save` wrote; the actor must have been loaded before."""
         state = load_file(folder / WEIGHTS)
         state |= {name: value for name, value in self.state_dict().items() if name.startswith("policy.")}
         self.load_state_dict(state)
         load_optimizer_state(self.optimizers, folder)
 
-    def _seen(self, sample: Sample) -> tuple[tuple[tuple[Tensor, Tensor], ...], Tensor]:
-        """Return what the networks get before and after the actions, and these, moved and cut alike at random."""
-        device = self.log_temperature.device
-        frames = self.codec.unpack(sample.frames, device)
-        action = sample.action.to(device)
-        motion = self.policy.random_transform(action)
-        place = torch.rand(len(action), 2, device=device).repeat(2, 1)
-        if motion is not None:
-            action = self.config.actions.transform(action, motion, absolute_yaw=False).clamp(-1, 1)
-            motion = motion.repeated(2)
-        picture, state = self.policy.network_input(frames, motion, place)
-        return tuple(zip(picture.chunk(2), state.chunk(2), strict=True)), action
-
     @torch.no_grad()
-    def _follow(self) -> None:
+    def _update_target(self) -> None:
         self.updates += 1
         if self.config.target_update == "polyak":
-            rate = self.config.target_rate
+            tau = self.config.target_tau
         else:
-            rate = float(int(self.updates) % self.config.target_interval == 0)
-        if rate:
+            tau = float(int(self.updates) % self.config.target_interval == 0)
+        if tau:
             for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                slow.lerp_(fast, rate)
+                slow.lerp_(fast, tau)

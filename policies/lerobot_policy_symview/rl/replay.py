@@ -1,8 +1,9 @@
-"""Prioritised experience replay in compact types, each frame stored once.
+"""Prioritised experience replay (Schaul et al., 2015) in compact types, each frame stored once.
 
-Transitions are stored where they happen, in `streams`: the demonstrations are one, each simulator is another. A stream
-is a ring of slots. A slot has a frame and, if an action was taken there, what came of it; the frame that the action led
-to is the next slot's. When a ring is full, its oldest slot is overwritten; the demonstrations' is never full.
+Transitions are stored in the order they happen, in one `stream` per source: stream 0 has the demonstrations, each
+simulator has one of its own. A stream is a ring buffer of slots. A slot holds a frame (a packed observation) and, if an
+action was taken there, the action, reward and priority of the transition; the transition's next frame is that of the
+next slot. A full ring overwrites its oldest slot; the demonstrations' stream is large enough never to be full.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ from lerobot_policy_symview.inputs.observation_codec import StoredObservation
 
 @dataclass(frozen=True)
 class ReplayConfig:
-    """What is remembered, and what is sampled from it (Schaul et al., 2015)."""
+    """Capacity and sampling of the prioritised replay buffer (Schaul et al., 2015)."""
 
     capacity: int = 100_000
-    """Transitions of the simulators to keep; no more are provided for than the training makes."""
+    """Most transitions to keep of all simulators together; memory is reserved for no more than the run makes."""
     alpha: float = 0.6
-    """Power of the priority that the chance of being sampled is proportional to."""
+    """Exponent of the priorities: transition i is sampled with probability proportional to p_i ** alpha."""
     beta: float = 0.4
-    """Power of the correction for unequal chances at the start; it grows to 1 in the end."""
+    """Initial exponent of the importance-sampling weights; it grows linearly to 1 at the end of the run."""
     epsilon: float = 1e-6
-    """Added to every priority."""
-    expert_bonus: float = 1.0
-    """Added to the priority of what the expert did."""
+    """Added to every priority, so that transitions without TD error are still sampled."""
+    demo_priority_bonus: float = 1.0
+    """Added to the priorities of demonstrated transitions."""
     memory_limit_gb: float = 8.0
-    """Frames that need more are kept in files in the output folder, memory-mapped."""
+    """Frames that need more memory than this are stored in memory-mapped files in the output folder."""
 
     def __post_init__(self) -> None:
         for name in ("alpha", "beta"):
@@ -44,24 +45,24 @@ class ReplayConfig:
                 raise ValueError(f"--replay.{name} must lie in [0, 1], got {getattr(self, name)}")
         if self.epsilon <= 0:
             raise ValueError(f"--replay.epsilon must be positive, got {self.epsilon}")
-        if self.expert_bonus < 0:
-            raise ValueError(f"--replay.expert_bonus must not be negative, got {self.expert_bonus}")
+        if self.demo_priority_bonus < 0:
+            raise ValueError(f"--replay.demo_priority_bonus must not be negative, got {self.demo_priority_bonus}")
         if self.capacity < 1:
             raise ValueError(f"--replay.capacity must be at least 1, got {self.capacity}")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Transitions drawn from a replay; B of them.
+    """A batch of B transitions.
 
     Args:
-        slots: (B,) where they are.
-        frames: feature -> (2 B, ...), what was seen before and, in the second half, after the action, as stored.
+        slots: (B,) slots of the transitions, for `Replay.update_priorities`.
+        frames: feature -> (2 B, ...), as stored: the observations, then the next observations.
         action: (B, A) scaled.
         reward: (B,).
-        terminal: (B,) bool, whether nothing follows; the frame after it is then the one before.
-        expert: (B,) bool.
-        weight: (B,) in (0, 1], the correction for unequal chances.
+        terminal: (B,) bool; the next observation of a terminal transition is its observation again.
+        is_demo: (B,) bool, whether the transition is from the demonstrations.
+        weight: (B,) in (0, 1], importance-sampling weights.
     """
 
     slots: NDArray[np.int64]
@@ -69,124 +70,136 @@ class Sample:
     action: Tensor
     reward: Tensor
     terminal: Tensor
-    expert: Tensor
+    is_demo: Tensor
     weight: Tensor
 
 
 class Replay:
-    """Streams of transitions, sampled in proportion to a power of their priority.
+    """Prioritised replay buffer of several streams.
 
     Args:
-        config: what is remembered.
-        example: a frame, whose shapes and types all frames have.
-        actions: entries of an action.
-        lengths: slots of every stream; the first is the expert's.
-        folder: where frames are kept if they need more memory than allowed.
+        config: capacity and sampling.
+        example: a frame, for the shapes and types of all frames.
+        action_dim: A, dimensions of an action.
+        lengths: slots of every stream; the first is the demonstrations'.
+        folder: folder of the frames' files if they need more memory than allowed.
+
+    Attributes:
+        columns: `action` (slots, A), `reward`, `terminal` and `priority` (slots,); the priorities are p_i ** alpha, and
+            0 where no transition begins.
+        frames: feature -> (slots, ...).
     """
 
     def __init__(
-        self, config: ReplayConfig, example: StoredObservation, actions: int, lengths: Sequence[int], folder: Path
+        self, config: ReplayConfig, example: StoredObservation, action_dim: int, lengths: Sequence[int], folder: Path
     ):
         self.config = config
         self._first = np.concatenate([[0], np.cumsum(lengths)])
         self.slots = slots = int(self._first[-1])
-        self._columns: dict[str, NDArray[Any]] = {
-            "action": np.zeros((slots, actions), np.float32),
+        self.columns: dict[str, NDArray[Any]] = {
+            "action": np.zeros((slots, action_dim), np.float32),
             "reward": np.zeros(slots, np.float32),
             "terminal": np.zeros(slots, bool),
-            "chance": np.zeros(slots),  # the power of the priority; 0 where no action was taken
+            "priority": np.zeros(slots),
         }
         frame_bytes = sum(array.nbytes for array in example.values())
         on_disk = slots * frame_bytes > config.memory_limit_gb * 1e9
-        self._frames = {
+        self.frames = {
             name: _allocate((slots, *array.shape), array.dtype, folder / f"{name}.npy" if on_disk else None)
             for name, array in example.items()
         }
-        self._head: NDArray[np.int64] = np.full(len(lengths), -1)  # within the stream
-        self._written: NDArray[np.int64] = np.zeros(len(lengths), np.int64)  # slots, per stream
-        self._highest = 1.0  # priority so far, which new transitions get
+        self._head: NDArray[np.int64] = np.full(len(lengths), -1)  # newest slot, within each stream
+        self._written: NDArray[np.int64] = np.zeros(len(lengths), np.int64)  # slots in use, of each stream
+        self._max_priority = 1.0  # so far, before the exponent; new transitions get it
 
     def __len__(self) -> int:
-        """Transitions that can be sampled."""
-        return int(np.count_nonzero(self._columns["chance"]))
+        """Number of transitions that can be sampled."""
+        return int(np.count_nonzero(self.columns["priority"]))
 
     @property
     def bytes_per_transition(self) -> int:
         """Memory of a slot."""
-        return sum(array[0].nbytes for array in (self._columns | self._frames).values())
+        return sum(array[0].nbytes for array in (self.columns | self.frames).values())
 
     @property
     def is_on_disk(self) -> bool:
-        """Whether frames are kept in files."""
-        return any(isinstance(array, np.memmap) for array in self._frames.values())
+        """Whether frames are stored in memory-mapped files."""
+        return any(isinstance(array, np.memmap) for array in self.frames.values())
 
-    def begin(self, stream: int, frame: StoredObservation) -> None:
-        """Write what an episode begins with."""
+    def start_episode(self, stream: int, frame: StoredObservation) -> None:
+        """Write the first frame of an episode to a stream."""
         self._advance(stream, frame)
 
-    def add(
+    def add_transition(
         self,
         stream: int,
         action: NDArray[np.float32],
         reward: float,
         terminal: bool,
-        following: StoredObservation | None,
+        next_frame: StoredObservation | None,
     ) -> None:
-        """Complete the stream's newest slot.
+        """Add the transition that begins at the stream's newest frame.
 
         Args:
-            stream: which.
+            stream: index of the stream.
             action: (A,) scaled.
-            reward: for it.
-            terminal: whether nothing follows.
-            following: the frame that follows; None if `terminal`.
+            reward: of the action.
+            terminal: whether the episode ends here without bootstrapping.
+            next_frame: frame after the action; None if `terminal`.
+
+        Raises:
+            ValueError: if a terminal transition has a next frame, or another has none.
         """
-        if terminal != (following is None):
-            raise ValueError("a transition is followed by a frame unless it is terminal")
+        if terminal != (next_frame is None):
+            raise ValueError("a transition needs a next frame unless it is terminal")
         slot = self._slot(stream)
-        self._columns["action"][slot] = action
-        self._columns["reward"][slot] = reward
-        self._columns["terminal"][slot] = terminal
-        self._columns["chance"][slot] = self._highest**self.config.alpha
-        if following is not None:
-            self._advance(stream, following)
+        self.columns["action"][slot] = action
+        self.columns["reward"][slot] = reward
+        self.columns["terminal"][slot] = terminal
+        self.columns["priority"][slot] = self._max_priority**self.config.alpha
+        if next_frame is not None:
+            self._advance(stream, next_frame)
 
     def sample(self, count: int, beta: float, rng: np.random.Generator) -> Sample:
-        """Draw transitions, one from each of `count` equal parts of the sum of all chances.
+        """Sample transitions in proportion to their priorities, one from each of `count` equal parts of their sum.
 
         Args:
             count: B.
-            beta: power of the correction.
-            rng: draws them.
+            beta: exponent of the importance-sampling weights (1 / (N P(i))) ** beta, scaled to a maximum of 1.
+            rng: random generator.
         """
-        chance = self._columns["chance"]
-        sums = chance.cumsum()
-        drawn = (np.arange(count) + rng.random(count)) / count * sums[-1]
-        slots = np.minimum(sums.searchsorted(drawn, side="right"), np.flatnonzero(chance)[-1])
-        terminal = self._columns["terminal"][slots]
-        weight = (chance[slots] / sums[-1] * len(self)) ** -beta
-        gathered = torch.from_numpy(np.concatenate([slots, np.where(terminal, slots, self._after(slots))]))
+        priority = self.columns["priority"]
+        cumulative = priority.cumsum()
+        drawn = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
+        slots = np.minimum(cumulative.searchsorted(drawn, side="right"), np.flatnonzero(priority)[-1])
+        terminal = self.columns["terminal"][slots]
+        probability = priority[slots] / cumulative[-1]
+        weight = (probability * len(self)) ** -beta
+        gathered = torch.from_numpy(np.concatenate([slots, np.where(terminal, slots, self._next(slots))]))
         return Sample(
             slots=slots,
-            frames={name: torch.from_numpy(array).index_select(0, gathered) for name, array in self._frames.items()},
-            action=torch.from_numpy(self._columns["action"][slots]),
-            reward=torch.from_numpy(self._columns["reward"][slots]),
+            frames={name: torch.from_numpy(array).index_select(0, gathered) for name, array in self.frames.items()},
+            action=torch.from_numpy(self.columns["action"][slots]),
+            reward=torch.from_numpy(self.columns["reward"][slots]),
             terminal=torch.from_numpy(terminal),
-            expert=torch.from_numpy(self._is_expert(slots)),
+            is_demo=torch.from_numpy(self._is_demo(slots)),
             weight=torch.from_numpy((weight / weight.max()).astype(np.float32)),
         )
 
-    def prioritise(self, slots: NDArray[np.int64], errors: NDArray[np.floating]) -> None:
-        """Set priorities from the errors (B,) of estimated values, before anything is added to what was drawn from."""
-        priority = errors + self.config.expert_bonus * self._is_expert(slots) + self.config.epsilon
-        self._columns["chance"][slots] = priority**self.config.alpha
-        self._highest = max(self._highest, float(priority.max()))
+    def update_priorities(self, slots: NDArray[np.int64], td_errors: NDArray[np.floating]) -> None:
+        """Set the priorities of sampled transitions to their absolute TD errors (B,), epsilon and the demos' bonus.
+
+        Call it before anything is added after the sampling, which may overwrite the slots.
+        """
+        priority = td_errors + self.config.demo_priority_bonus * self._is_demo(slots) + self.config.epsilon
+        self.columns["priority"][slots] = priority**self.config.alpha
+        self._max_priority = max(self._max_priority, float(priority.max()))
 
     def save(self, folder: Path) -> None:
-        """Write everything that was ever written to a new folder."""
+        """Write all slots in use to a new folder."""
         folder.mkdir()
         used = [slice(first, first + count) for first, count in zip(self._first, self._written, strict=False)]
-        for name, array in (self._columns | self._frames).items():
+        for name, array in (self.columns | self.frames).items():
             shape = (int(self._written.sum()), *array.shape[1:])
             file = _mapped(folder / f"{name}.npy", shape, array.dtype)
             begin = 0
@@ -195,15 +208,15 @@ class Replay:
                 file[begin:end] = array[part]
                 begin = end
             file.flush()
-        state = {"head": self._head.tolist(), "written": self._written.tolist(), "highest": self._highest}
+        state = {"head": self._head.tolist(), "written": self._written.tolist(), "max_priority": self._max_priority}
         (folder / "state.json").write_text(json.dumps(state))
 
     def load(self, folder: Path) -> None:
-        """Take over what `save` wrote for streams of the same lengths."""
+        """Load what `save` wrote for streams of the same lengths."""
         state = json.loads((folder / "state.json").read_text())
         self._head, self._written = np.array(state["head"]), np.array(state["written"])
-        self._highest = state["highest"]
-        for name, array in (self._columns | self._frames).items():
+        self._max_priority = state["max_priority"]
+        for name, array in (self.columns | self.frames).items():
             saved = np.load(folder / f"{name}.npy", mmap_mode="r")
             begin = 0
             for first, count in zip(self._first, self._written, strict=False):
@@ -215,24 +228,24 @@ class Replay:
         self._head[stream] = (self._head[stream] + 1) % length
         self._written[stream] = max(self._written[stream], self._head[stream] + 1)
         slot = self._slot(stream)
-        self._columns["chance"][slot] = 0.0
-        for name, array in self._frames.items():
+        self.columns["priority"][slot] = 0.0
+        for name, array in self.frames.items():
             array[slot] = frame[name]
 
     def _slot(self, stream: int) -> int:
         return int(self._first[stream] + self._head[stream])
 
-    def _after(self, slots: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _next(self, slots: NDArray[np.int64]) -> NDArray[np.int64]:
         stream = self._first.searchsorted(slots, side="right") - 1
         return np.where(slots + 1 == self._first[stream + 1], self._first[stream], slots + 1)
 
-    def _is_expert(self, slots: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _is_demo(self, slots: NDArray[np.int64]) -> NDArray[np.bool_]:
         return slots < self._first[1]
 
 
 def _allocate(shape: tuple[int, ...], dtype: np.dtype, file: Path | None) -> NDArray[Any]:
     if file is None:
-        return np.zeros(shape, dtype)  # memory that is not written to is not taken
+        return np.zeros(shape, dtype)  # the operating system provides memory when it is written to
     file.parent.mkdir(parents=True, exist_ok=True)
     return _mapped(file, shape, dtype)
 

@@ -1,4 +1,4 @@
-"""Policies in simulators: what they see there, and how well they do in several at once."""
+"""Rollouts of policies in simulators, and their evaluation in several simulators at once."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from lerobot_symview.geometry.units import Unit
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observation, Observed, Reset, Simulators, Step
 
-EVALUATION_SEED = 1000  # lerobot-eval's first, so that both see the same scenes
+EVALUATION_SEED = 1000  # first seed of lerobot-eval, so that both evaluate on the same scenes
 
-Act = Callable[[list[Observation]], NDArray[np.float32]]
-"""Maps B observations to B actions in metres and radians, (B, A)."""
+SelectActions = Callable[[list[Observation]], NDArray[np.float32]]
+"""Maps B observations to actions (B, A) in metres and radians."""
 
 
 class Actor:
-    """A policy with its processors, acting on what simulators report.
+    """A policy with its processors, which acts on the observations of simulators.
 
     Args:
         policy: the policy.
@@ -40,39 +40,42 @@ class Actor:
         self.policy = policy
         self.preprocessor, self.postprocessor = make_processors(policy.config, depth_units=metric_depth(policy.config))
 
-    def seen(self, observations: list[Observation]) -> dict[str, Tensor]:
-        """Return B observations as the preprocessor leaves them."""
+    def preprocess(self, observations: list[Observation]) -> dict[str, Tensor]:
+        """Return B observations as a preprocessed batch."""
         names = observations[0]
-        stacked = {name: torch.from_numpy(np.stack([one[name] for one in observations])) for name in names}
-        delivered = {name: _as_delivered(values) for name, values in stacked.items()}
-        batch: dict[str, Tensor] = self.preprocessor(delivered)
+        stacked = {
+            name: torch.from_numpy(np.stack([observation[name] for observation in observations])) for name in names
+        }
+        batch: dict[str, Tensor] = self.preprocessor(
+            {name: _to_lerobot_layout(values) for name, values in stacked.items()}
+        )
         return batch
 
     def __call__(self, observations: list[Observation]) -> NDArray[np.float32]:
-        """Return the actions (B, A), in metres and radians."""
-        actions: Tensor = self.postprocessor(self.policy.select_action(self.seen(observations)))
+        """Return the evaluation actions (B, A), in metres and radians."""
+        actions: Tensor = self.postprocessor(self.policy.select_action(self.preprocess(observations)))
         return actions.numpy()
 
 
-def metric_depth(config: SymviewConfig) -> dict[str, Unit]:
-    """Return the units of depth from simulators and from `open_dataset`: metres."""
-    depth = [keys.depth(config.camera), keys.depth("top"), config.height_key]
-    return {key: "m" for key in depth if key is not None}
-
-
-def _as_delivered(values: Tensor) -> Tensor:
-    """Return images (B, H, W, C) as LeRobot delivers an environment's: (B, C, H, W), colour in [0, 1]."""
+def _to_lerobot_layout(values: Tensor) -> Tensor:
+    """Return images (B, H, W, C) in LeRobot's layout for environments: (B, C, H, W), RGB in [0, 1]."""
     if values.ndim != 4:
         return values
     values = values.permute(0, 3, 1, 2)
     return values.float() / 255 if values.dtype == torch.uint8 else values
 
 
-def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
-    """Return what simulators of `env` must report for a policy to act.
+def metric_depth(config: SymviewConfig) -> dict[str, Unit]:
+    """Return the unit of depth from simulators and from `open_dataset`: metres."""
+    depth = [keys.depth(config.camera), keys.depth("top"), config.height_key]
+    return {key: "m" for key in depth if key is not None}
+
+
+def simulator_config(config: SymviewConfig, env: EnvSettings) -> Observed:
+    """Return the configuration of simulators of `env` whose observations have the features that a policy needs.
 
     Raises:
-        ValueError: if the state that the policy declares is not that of the simulators.
+        ValueError: if `config.state_symmetry` does not fit the simulators' state.
     """
     config.states.check(len(keys.STATE_NAMES), keys.STATE)
     if any(
@@ -80,8 +83,8 @@ def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
         for kind, name in zip(config.state_symmetry, keys.STATE_NAMES, strict=True)
     ):
         raise ValueError(
-            f"--policy.state_symmetry={config.state_symmetry} puts entries where a simulator's state has others: "
-            f"it is {', '.join(keys.STATE_NAMES)}"
+            f"--policy.state_symmetry={config.state_symmetry} does not fit the simulators' state, which is "
+            f"[{', '.join(keys.STATE_NAMES)}]"
         )
     return Observed(
         env=env,
@@ -94,39 +97,50 @@ def observed(config: SymviewConfig, env: EnvSettings) -> Observed:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What came of episodes, in the order of their seeds."""
+    """Results of evaluation episodes, in the order of their seeds."""
 
     success: list[bool]
     discounted_return: list[float]
 
     @property
     def success_rate(self) -> float:
-        """Part of the episodes that succeeded."""
+        """Fraction of the episodes that succeeded."""
         return statistics.fmean(self.success)
 
     @property
     def mean_return(self) -> float:
-        """Of the discounted returns."""
+        """Mean discounted return."""
         return statistics.fmean(self.discounted_return)
 
 
 @dataclass
-class _Episode:
+class _EvaluationEpisode:
     seed: int
     observation: Observation | None = None
     steps: int = 0
     discounted_return: float = 0.0
 
 
-def evaluate(act: Act, simulators: Simulators, seeds: Sequence[int], discount: float) -> Evaluation:
-    """Run an episode from every seed; an episode whose simulator dies is run again."""
+def evaluate(
+    select_actions: SelectActions, simulators: Simulators, seeds: Sequence[int], discount: float
+) -> Evaluation:
+    """Run one episode per seed; an episode whose simulator dies is run again.
+
+    Args:
+        select_actions: the policy, such as an `Actor`.
+        simulators: simulators to run in, as many episodes at a time.
+        seeds: seeds of the episodes.
+        discount: discount factor of the returns.
+    """
     waiting = deque(seeds)
-    running: dict[int, _Episode] = {}
+    running: dict[int, _EvaluationEpisode] = {}
     finished: dict[int, tuple[bool, float]] = {}
     with tqdm(total=len(seeds), desc="evaluation", unit="episode", leave=False) as bar:
         while waiting or running:
-            _begin(simulators, running, waiting)
-            actions = act([episode.observation for episode in running.values() if episode.observation is not None])
+            _start_episodes(simulators, running, waiting)
+            actions = select_actions(
+                [episode.observation for episode in running.values() if episode.observation is not None]
+            )
             for index, action in zip(running, actions, strict=True):
                 simulators.send(index, Step(action, next_seed=None))
             for index, episode in list(running.items()):
@@ -144,11 +158,11 @@ def evaluate(act: Act, simulators: Simulators, seeds: Sequence[int], discount: f
     return Evaluation(list(success), list(discounted_return))
 
 
-def _begin(simulators: Simulators, running: dict[int, _Episode], waiting: deque[int]) -> None:
-    """Begin an episode in every simulator that has none, as far as seeds are waiting."""
-    begun = [index for index in range(len(simulators)) if index not in running][: len(waiting)]
-    for index in begun:
-        running[index] = _Episode(waiting.popleft())
+def _start_episodes(simulators: Simulators, running: dict[int, _EvaluationEpisode], waiting: deque[int]) -> None:
+    """Start an episode in every idle simulator while seeds are waiting."""
+    started = [index for index in range(len(simulators)) if index not in running][: len(waiting)]
+    for index in started:
+        running[index] = _EvaluationEpisode(waiting.popleft())
         simulators.send(index, Reset(running[index].seed))
-    for index in begun:
+    for index in started:
         running[index].observation = simulators.receive(index).observation

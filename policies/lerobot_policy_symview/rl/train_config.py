@@ -14,36 +14,36 @@ from symview_sim.settings import EnvSettings, RecordedDataset
 
 @dataclass(frozen=True)
 class TrainRlConfig:
-    """Train a policy by soft actor-critic from demonstrations, in simulators that run beside the updates."""
+    """Train a policy by soft actor-critic from demonstrations (SACfD) in parallel simulators."""
 
     dataset: RecordedDataset = field(default_factory=RecordedDataset)
-    """Demonstrations of the task, by the same cameras."""
+    """Demonstrations of the task, recorded with the same cameras."""
     env: EnvSettings = field(default_factory=EnvSettings)
-    """What is simulated."""
+    """Task, robot and cameras to simulate."""
     policy: SymviewSacfdConfig = field(default_factory=SymviewSacfdConfig)
-    """The policy and how it is updated."""
+    """The policy, its network and its updates."""
     replay: ReplayConfig = field(default_factory=ReplayConfig)
-    """What is remembered and sampled."""
+    """Prioritised replay buffer."""
     output_dir: Path = Path("outputs/train_rl")
-    """Folder of the checkpoints, tables and logs."""
+    """Folder of the checkpoints, metrics and logs."""
     steps: int = 5000
-    """Joint steps: in each, every simulator takes one action and the networks are updated once."""
+    """Training steps: in each, every simulator takes one action and the networks are updated once."""
     batch_size: int = 128
-    """Transitions per update; updates begin when so many are remembered."""
+    """Transitions per update; updates start when the replay buffer holds as many."""
     num_simulators: int = 5
-    """Simulators that run in parallel, each in a process of its own."""
+    """Simulators that run in parallel, each in its own process."""
     seed: int = 0
-    """Of scenes, networks and sampling. On a CPU, the same seed gives the same run."""
+    """Random seed of scenes, networks and sampling. On a CPU, runs of the same seed are bit-identical."""
     eval_every: int = 200
     """Steps between evaluations."""
     eval_episodes: int = 100
-    """Episodes of each, on the scenes that `lerobot-eval` shows."""
+    """Episodes per evaluation, on the scenes of `lerobot-eval`."""
     log_every: int = 20
-    """Steps that a row of `training.csv` averages over."""
+    """Steps between rows of `training.csv`, which average over them."""
     save_every: int = 1000
-    """Steps between checkpoints; the last one has what is needed to resume."""
+    """Steps between checkpoints. Every checkpoint has the policy; only the last one can be resumed from."""
     resume: bool = False
-    """Go on from the last checkpoint in `output_dir`."""
+    """Resume from the last checkpoint in `output_dir`."""
     wandb: WandBConfig = field(default_factory=WandBConfig)
     """Logging to Weights & Biases: `--wandb.enable=true`, offline with `--wandb.mode=offline`."""
 
@@ -55,4 +55,4 @@ class TrainRlConfig:
         if self.seed < 0:
             raise ValueError(f"--seed must not be negative, got {self.seed}")
         if self.policy.view == "top" and not self.env.oracle:
-            raise ValueError(f"--policy.method={self.policy.method} sees the camera top: use --env.oracle=true")
+            raise ValueError(f"--policy.method={self.policy.method} needs the camera 'top': use --env.oracle=true")

@@ -1,4 +1,4 @@
-"""`symview-train-rl`: soft actor-critic from demonstrations, beside simulators."""
+"""`symview-train-rl`: soft actor-critic from demonstrations (SACfD) in parallel simulators."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from types import FrameType
 
 from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, push_policy, restore, save_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
-from lerobot_policy_symview.rl.learner import MEASURES
-from lerobot_policy_symview.rl.records import Records
+from lerobot_policy_symview.rl.learner import METRICS
+from lerobot_policy_symview.rl.metrics import MetricsLogger, MetricsWindow
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
-from lerobot_policy_symview.rl.training import Interval, Training
+from lerobot_policy_symview.rl.training import Training
 from lerobot_symview.runtime.cli import run_command
 
 logger = logging.getLogger(__name__)
@@ -28,50 +28,51 @@ EXAMPLES = """\
 
 
 def train_rl(config: TrainRlConfig) -> Path:
-    """Run or go on with the training that `config` describes, and return its last checkpoint.
+    """Run or resume a training, and return its last checkpoint.
 
     Raises:
-        CommandError: if there is no dataset, or the output folder does not fit.
-        KeyboardInterrupt: after a checkpoint was saved, if Ctrl-C was pressed.
+        CommandError: if there is no dataset, or the content of the output folder does not fit.
+        KeyboardInterrupt: if Ctrl-C was pressed, after saving a checkpoint.
     """
-    begun = last_checkpoint(config)
+    last = last_checkpoint(config)
     description = describe(config)
     with Training(config, open_dataset(config.dataset)) as training, _interruptions() as interruptions:
         run_id = config.wandb.run_id
-        if begun:
-            run_id = restore(training, begun) or run_id
+        if last:
+            run_id = restore(training, last) or run_id
         else:
-            training.begin()
-        _tell(training)
-        with Records(config, training.step, run_id, description) as records:
-            checkpoint, saved = begun, training.step if begun else None
+            training.start()
+        _log_replay_size(training)
+        with MetricsLogger(config, training.step, run_id, description) as logs:
+            checkpoint, saved_step = last, training.step if last else None
             while training.step < config.steps and not interruptions:
                 training.joint_step()
-                records.advance()
+                logs.advance()
                 is_last = training.step == config.steps
                 if training.step % config.log_every == 0 or is_last:
-                    records.training(training.step, training.interval.row(MEASURES))
-                    training.interval = Interval()
+                    logs.log_training(training.step, training.window.averages(METRICS))
+                    training.window = MetricsWindow()
                 if training.step % config.eval_every == 0 or is_last:
-                    found = training.evaluate()
-                    records.evaluation(training.step, {"success": found.success_rate, "return": found.mean_return})
+                    evaluation = training.evaluate()
+                    row = {"success": evaluation.success_rate, "return": evaluation.mean_return}
+                    logs.log_evaluation(training.step, row)
                 if training.step % config.save_every == 0:
-                    checkpoint, saved = save_checkpoint(training, records.run_id), training.step
-            if checkpoint is None or saved != training.step:
-                checkpoint = save_checkpoint(training, records.run_id)
+                    checkpoint, saved_step = save_checkpoint(training, logs.run_id), training.step
+            if checkpoint is None or saved_step != training.step:
+                checkpoint = save_checkpoint(training, logs.run_id)
         if config.policy.push_to_hub and config.policy.repo_id and not interruptions:
             push_policy(training, checkpoint)
     if interruptions:
-        logger.info("stopped at step %d: the same command with --resume=true goes on from there", training.step)
+        logger.info("stopped at step %d; run the same command with --resume=true to resume", training.step)
         raise KeyboardInterrupt
     logger.info("the policy is in %s", checkpoint / "pretrained_model")
     return checkpoint
 
 
-def _tell(training: Training) -> None:
+def _log_replay_size(training: Training) -> None:
     replay = training.replay
     logger.info(
-        "%d demonstrated transitions; %.1f kB for each transition, %.2f GB %s for all",
+        "replay buffer: %d demonstrated transitions; %.1f kB per transition, %.2f GB %s when full",
         len(replay),
         replay.bytes_per_transition / 1e3,
         replay.bytes_per_transition * replay.slots / 1e9,
@@ -81,15 +82,15 @@ def _tell(training: Training) -> None:
 
 @contextmanager
 def _interruptions() -> Iterator[list[int]]:
-    """Yield a list that Ctrl-C adds to instead of ending the process at once; a second one does that."""
+    """Yield a list to which the first Ctrl-C is added instead of ending the process; the second one ends it."""
     caught: list[int] = []
 
-    def note(number: int, frame: FrameType | None) -> None:
+    def catch(number: int, frame: FrameType | None) -> None:
         caught.append(number)
         signal.signal(signal.SIGINT, previous)
-        logger.info("finishing the step and saving; press Ctrl-C again to stop at once")
+        logger.info("finishing the step and saving a checkpoint; press Ctrl-C again to stop at once")
 
-    previous = signal.signal(signal.SIGINT, note)
+    previous = signal.signal(signal.SIGINT, catch)
     try:
         yield caught
     finally:

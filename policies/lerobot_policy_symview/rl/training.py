@@ -1,13 +1,13 @@
-"""The training of `symview_sacfd`: simulators act while the networks are updated.
+"""The training loop of `symview_sacfd`: simulators act while the networks are updated.
 
-Every joint step sends one action to each simulator, updates the networks once from what was known before, and takes in
-what came of the actions. Nothing depends on which of the two is faster, so that a run can be repeated bit for bit.
+Each training step sends one action to every simulator, updates the networks once from the transitions stored before,
+and then stores the new transitions. The result does not depend on which of the two is faster, so that runs on a CPU are
+bit-identical.
 """
 
 from __future__ import annotations
 
 import math
-import statistics
 import time
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -22,62 +22,31 @@ from tqdm import tqdm
 
 from lerobot_policy_symview.inputs.observation_codec import StoredObservation
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
-from lerobot_policy_symview.rl.demonstrations import check_scene, observations, outcomes, ranges
+from lerobot_policy_symview.rl.demonstrations import check_scene, observations, ranges, rewards_and_ends
 from lerobot_policy_symview.rl.learner import Learner
+from lerobot_policy_symview.rl.metrics import MetricsWindow
 from lerobot_policy_symview.rl.replay import Replay
-from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, observed
+from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, simulator_config
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from symview_sim.simulators import Observation, Outcome, Reset, Simulators, Step
 
-EXPERT = 0  # the stream of the demonstrations; simulator i has the stream i + 1
+DEMONSTRATIONS = 0  # replay stream of the demonstrations; simulator i has the stream i + 1
 
 
 @dataclass
-class Episode:
-    """The episode that a simulator is in, which its seed and the actions taken determine."""
+class RunningEpisode:
+    """The unfinished episode of a simulator; its seed and actions suffice to restore it."""
 
     seed: int
     actions: list[NDArray[np.float32]] = field(default_factory=list)
     discounted_return: float = 0.0
 
 
-@dataclass
-class Interval:
-    """What happened since a row of the log."""
-
-    updates: int = 0
-    sums: dict[str, Any] = field(default_factory=dict)
-    success: list[bool] = field(default_factory=list)
-    discounted_return: list[float] = field(default_factory=list)
-    lost: int = 0
-
-    def add(self, measures: dict[str, Tensor]) -> None:
-        """Add an update's."""
-        self.updates += 1
-        for name, value in measures.items():
-            self.sums[name] = self.sums.get(name, 0.0) + value
-
-    def row(self, names: tuple[str, ...]) -> dict[str, float]:
-        """Return means, `nan` where there is nothing to average; reading them waits for a GPU."""
-        updates = {name: float(self.sums[name]) / self.updates if self.updates else math.nan for name in names}
-        return {
-            "episodes": len(self.success),
-            "success": statistics.fmean(self.success) if self.success else math.nan,
-            "return": statistics.fmean(self.discounted_return) if self.success else math.nan,
-            "lost_episodes": self.lost,
-            **updates,
-        }
-
-    def plain(self) -> dict[str, Any]:
-        """Return what a checkpoint's JSON holds; Python's floats survive it to the last bit."""
-        return vars(self) | {"sums": {name: float(value) for name, value in self.sums.items()}}
-
-
 class Training:
-    """A run: simulators, replay and learner, and how far they have come.
+    """A run: simulators, replay buffer and learner, and their progress.
 
     Args:
-        config: what to train.
+        config: the run's configuration.
         dataset: its demonstrations, a `LeRobotDataset`.
     """
 
@@ -93,14 +62,14 @@ class Training:
         self.policy.to(policy.device)
         self.actor = Actor(self.policy)
         self.learner = Learner(self.policy)
-        self.observed = observed(policy, config.env)
+        self.simulator_config = simulator_config(policy, config.env)
         self.replay = self._empty_replay()
-        self._simulators = Simulators(self.observed, config.num_simulators)
+        self.simulators = Simulators(self.simulator_config, config.num_simulators)
         self._evaluators: Simulators | None = None
         self.step = 0
-        self.episodes = [Episode(self._seed(i, 0)) for i in range(config.num_simulators)]
-        self.episodes_begun = [1] * config.num_simulators
-        self.interval = Interval()
+        self.episodes = [RunningEpisode(self._seed(i, 0)) for i in range(config.num_simulators)]
+        self.episodes_started = [1] * config.num_simulators
+        self.window = MetricsWindow()
         self.rng = np.random.default_rng(config.seed)
         self.seconds = dict.fromkeys(("network", "waiting", "simulation", "total"), 0.0)
 
@@ -111,99 +80,103 @@ class Training:
         self.close()
 
     def close(self) -> None:
-        """End the simulators."""
-        self._simulators.close()
+        """End the simulators' processes."""
+        self.simulators.close()
         if self._evaluators is not None:
             self._evaluators.close()
 
-    def begin(self) -> None:
-        """Fill the replay's beginning with the demonstrations, and begin an episode in every simulator."""
+    def start(self) -> None:
+        """Start a new run: store the demonstrations, and start an episode in every simulator."""
         self._request_episodes()
-        self._remember_demonstrations()
+        self._store_demonstrations()
         self._receive_episodes()
         for index, frame in enumerate(self.learner.codec.pack(self._batch)):
-            self.replay.begin(index + 1, frame)
+            self.replay.start_episode(index + 1, frame)
 
-    def go_on(self) -> None:
-        """Bring every simulator to where its episode is."""
+    def restore_simulators(self) -> None:
+        """Bring every simulator to the state of its running episode, by repeating the episode's actions."""
         self._request_episodes()
         self._receive_episodes()
 
     def joint_step(self) -> None:
-        """Act in every simulator, and update the networks meanwhile."""
+        """Step all simulators, and update the networks meanwhile."""
         start = time.perf_counter()
         scaled, actions = self.act()
         for index, action in enumerate(actions):
-            self._simulators.send(index, Step(action, self._seed(index, self.episodes_begun[index])))
+            self.simulators.send(index, Step(action, self._seed(index, self.episodes_started[index])))
         self.learn()
         learned = time.perf_counter()
-        received = [self._simulators.receive(index) for index in range(len(self.episodes))]
+        outcomes = [self.simulators.receive(index) for index in range(len(self.episodes))]
         waited = time.perf_counter()
-        self._take_in(scaled, actions, received)
+        self._store_transitions(scaled, actions, outcomes)
         self.step += 1
         self.seconds["network"] += learned - start
         self.seconds["waiting"] += waited - learned
-        self.seconds["simulation"] += max(outcome.seconds for outcome in received)
+        self.seconds["simulation"] += max(outcome.seconds for outcome in outcomes)
         self.seconds["total"] += time.perf_counter() - start
 
     def act(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Draw an action for every simulator: scaled and in metres and radians, (simulators, A) each."""
+        """Sample an action for every simulator: scaled, and in metres and radians, (simulators, A) each."""
         self.policy.eval()
         with torch.no_grad(), self.policy.precision():
-            scaled, _ = self.policy.draw(*self.policy.network_input(self._batch))
+            scaled, _ = self.policy.sample_action(*self.policy.network_input(self._batch))
         return scaled.cpu().numpy(), self._physical(scaled)
 
     def learn(self) -> None:
-        """Update the networks once, if enough is remembered."""
+        """Update the networks once, if the replay buffer has enough transitions for a batch."""
         if len(self.replay) < self.config.batch_size:
             return
         beta = self.config.replay.beta
         beta += (1 - beta) * self.step / self.config.steps
         sample = self.replay.sample(self.config.batch_size, beta, self.rng)
-        errors, measures = self.learner.update(sample)
-        self.replay.prioritise(sample.slots, errors)
-        self.interval.add(measures)
+        td_errors, metrics = self.learner.update(sample)
+        self.replay.update_priorities(sample.slots, td_errors)
+        self.window.add_update(metrics)
 
     def evaluate(self) -> Evaluation:
-        """Run the policy, without chance, on scenes that training does not see."""
+        """Evaluate the policy, without sampling its actions, on scenes that training does not use."""
         if self._evaluators is None:
-            self._evaluators = Simulators(self.observed, self.config.num_simulators)
+            self._evaluators = Simulators(self.simulator_config, self.config.num_simulators)
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.config.eval_episodes)
         return evaluate(self.actor, self._evaluators, seeds, self.config.policy.discount)
 
-    def _take_in(self, scaled: NDArray, actions: NDArray[np.float32], received: list[Outcome]) -> None:
-        """Remember what came of the actions."""
-        self._batch = self.actor.seen([_acted_upon(outcome) for outcome in received])
+    def pack(self, observation: Observation) -> StoredObservation:
+        """Return a simulator's observation as the replay buffer stores it."""
+        return self.learner.codec.pack(self.actor.preprocess([observation]))[0]
+
+    def _store_transitions(self, scaled: NDArray, actions: NDArray[np.float32], outcomes: list[Outcome]) -> None:
+        """Add the transitions to the replay buffer, and their rewards to the running episodes."""
+        self._batch = self.actor.preprocess([_observation_of(outcome) for outcome in outcomes])
         frames = self.learner.codec.pack(self._batch)
-        for index, (outcome, frame) in enumerate(zip(received, frames, strict=True)):
+        for index, (outcome, frame) in enumerate(zip(outcomes, frames, strict=True)):
             stream, episode = index + 1, self.episodes[index]
             if not outcome.lost:
-                ended = outcome.last is not None
-                terminal = outcome.terminated or (ended and self.config.policy.timeouts_are_terminal)
-                following = None if terminal else self._pack(outcome.last) if ended else frame
-                self.replay.add(stream, scaled[index], outcome.reward, terminal, following)
+                done = outcome.last is not None
+                terminal = outcome.terminated or (done and self.config.policy.timeouts_are_terminal)
+                next_frame = None if terminal else self.pack(outcome.last) if outcome.last is not None else frame
+                self.replay.add_transition(stream, scaled[index], outcome.reward, terminal, next_frame)
                 episode.discounted_return += self.config.policy.discount ** len(episode.actions) * outcome.reward
                 episode.actions.append(actions[index])
-                if not ended:
+                if not done:
                     continue
-                self.interval.success.append(outcome.success)
-                self.interval.discounted_return.append(episode.discounted_return)
+                self.window.success.append(outcome.success)
+                self.window.discounted_return.append(episode.discounted_return)
             else:
-                self.interval.lost += 1
-            self.replay.begin(stream, frame)
-            self.episodes[index] = Episode(self._seed(index, self.episodes_begun[index]))
-            self.episodes_begun[index] += 1
+                self.window.lost += 1
+            self.replay.start_episode(stream, frame)
+            self.episodes[index] = RunningEpisode(self._seed(index, self.episodes_started[index]))
+            self.episodes_started[index] += 1
 
     def _request_episodes(self) -> None:
         for index, episode in enumerate(self.episodes):
-            self._simulators.send(index, Reset(episode.seed, tuple(episode.actions)))
+            self.simulators.send(index, Reset(episode.seed, tuple(episode.actions)))
 
     def _receive_episodes(self) -> None:
-        received = [self._simulators.receive(index) for index in range(len(self.episodes))]
-        for index, outcome in enumerate(received):
-            if outcome.lost:  # begun anew, without the actions
-                self.episodes[index] = Episode(self.episodes[index].seed)
-        self._batch = self.actor.seen([_acted_upon(outcome) for outcome in received])
+        outcomes = [self.simulators.receive(index) for index in range(len(self.episodes))]
+        for index, outcome in enumerate(outcomes):
+            if outcome.lost:  # the replaced simulator has reset the episode without repeating its actions
+                self.episodes[index] = RunningEpisode(self.episodes[index].seed)
+        self._batch = self.actor.preprocess([_observation_of(outcome) for outcome in outcomes])
 
     def _empty_replay(self) -> Replay:
         config = self.config
@@ -215,35 +188,32 @@ class Training:
         lengths = [len(self._dataset), *[length] * config.num_simulators]
         return Replay(config.replay, example, action.shape[1], lengths, config.output_dir / "replay")
 
-    def _remember_demonstrations(self) -> None:
-        """Add what the expert did; actions beyond the simulator's limits are cut to them."""
-        reward, ends, succeeds = outcomes(self._dataset)
+    def _store_demonstrations(self) -> None:
+        """Add the demonstrations to the replay buffer; actions are clipped to the simulator's limits."""
+        reward, ends, succeeds = rewards_and_ends(self._dataset)
         frames: list[StoredObservation] = []
         actions = []
         for observation, action in tqdm(observations(self._dataset), desc="demonstrations", unit="batch", leave=False):
             frames += self.learner.codec.pack(self.actor.preprocessor(observation))
             actions.append(self.policy.scaled(action.to(self.policy.action_center.device)).clamp(-1, 1).cpu().numpy())
         scaled = np.concatenate(actions)
-        begins = np.append(True, ends[:-1])
+        starts = np.append(True, ends[:-1])
         for i, frame in enumerate(frames):
-            if begins[i]:
-                self.replay.begin(EXPERT, frame)
-            if not ends[i] or succeeds[i]:  # what followed the last frame of a failure is not known
-                self.replay.add(EXPERT, scaled[i], reward[i], bool(succeeds[i]), None if ends[i] else frames[i + 1])
-
-    def _pack(self, seen: Observation | None) -> StoredObservation:
-        assert seen is not None
-        return self.learner.codec.pack(self.actor.seen([seen]))[0]
+            if starts[i]:
+                self.replay.start_episode(DEMONSTRATIONS, frame)
+            if not ends[i] or succeeds[i]:  # the dataset lacks the observation after the last action of a failure
+                next_frame = None if ends[i] else frames[i + 1]
+                self.replay.add_transition(DEMONSTRATIONS, scaled[i], reward[i], bool(succeeds[i]), next_frame)
 
     def _physical(self, scaled: Tensor) -> NDArray[np.float32]:
         actions: Tensor = self.actor.postprocessor(self.policy.physical(scaled))
         return actions.numpy()
 
     def _seed(self, simulator: int, episode: int) -> int:
-        """Return the seed of a simulator's n-th episode, as good as never one of another training or recording."""
+        """Return the seed of a simulator's n-th episode; seeds of other runs and recordings almost surely differ."""
         return int(np.random.SeedSequence([self.config.seed, simulator, episode]).generate_state(1)[0])
 
 
-def _acted_upon(outcome: Outcome) -> Observation:
+def _observation_of(outcome: Outcome) -> Observation:
     assert outcome.observation is not None
     return outcome.observation

@@ -1,4 +1,4 @@
-"""The convolution on irreps against the dense one, which is its specification."""
+"""The convolution in the Fourier domain against the dense convolution, its specification."""
 
 import copy
 import multiprocessing
@@ -31,7 +31,7 @@ def two_threads():
 
 
 def layers(inputs, fields, padding, dtype=torch.float64, group=D4):
-    """A dense layer and a fast one with the same weights."""
+    """Return a dense and a Fourier layer with the same weights."""
     torch.manual_seed(0)
     dense, fast = (kind(group, inputs, fields, padding).to(dtype) for kind in (FieldConv2d, FourierConv2d))
     torch.nn.init.normal_(dense.bias)
@@ -43,15 +43,15 @@ def images_for(layer, batch=2, height=8, width=8):
     return torch.randn(batch, layer.weight.shape[1], height, width, dtype=layer.weight.dtype)
 
 
-def assert_near(found, expected):
+def assert_near(actual, expected):
     limit = TOLERANCES[expected.dtype] * expected.abs().max()
-    assert found.dtype == expected.dtype
-    assert found.shape == expected.shape
-    assert (found - expected).abs().max() <= limit
+    assert actual.dtype == expected.dtype
+    assert actual.shape == expected.shape
+    assert (actual - expected).abs().max() <= limit
 
 
 def is_fast(layer, images, pool=False):
-    return layer._plan(images, pool) is not None
+    return layer.plan(images, pool) is not None
 
 
 @pytest.mark.parametrize("dtype", TOLERANCES)
@@ -70,9 +70,7 @@ def is_fast(layer, images, pool=False):
         (SCALARS, 2, 9, 7, 0, False, 1),
     ],
 )
-def test_results_and_gradients_are_those_of_the_dense_convolution(
-    inputs, fields, height, width, padding, pool, batch, dtype
-):
+def test_outputs_and_gradients_match_the_dense_convolution(inputs, fields, height, width, padding, pool, batch, dtype):
     pair = layers(inputs, fields, padding, dtype)
     images = images_for(pair[0], batch, height, width)
     results = []
@@ -82,29 +80,29 @@ def test_results_and_gradients_are_those_of_the_dense_convolution(
         out.backward(torch.linspace(-1, 1, out.numel(), dtype=dtype).view(out.shape).cos())
         results.append([out.detach(), layer.weight.grad, layer.bias.grad, given.grad])
     assert is_fast(pair[1], images, pool)
-    for expected, found in zip(*results, strict=True):
+    for expected, actual in zip(*results, strict=True):
         if expected is not None:
-            assert_near(found, expected)
+            assert_near(actual, expected)
 
 
 @pytest.mark.parametrize("pool", [False, True])
-def test_moving_the_images_moves_the_result(pool):
+def test_the_layer_is_equivariant(pool):
     _, layer = layers(2, 3, 1)
     images = images_for(layer)
     expected = layer(images, pool).unflatten(1, (D4.size, -1))
     for element in range(D4.size):
-        found = layer(move(images, element), pool).unflatten(1, (D4.size, -1))
-        assert_near(found, move(expected.flatten(1, 2), element).unflatten(1, (D4.size, -1)))
+        actual = layer(transform(images, element), pool).unflatten(1, (D4.size, -1))
+        assert_near(actual, transform(expected.flatten(1, 2), element).unflatten(1, (D4.size, -1)))
 
 
-def move(images, element):
+def transform(images, element):
     """Transform fields (B, 8 n, H, W) by an element of D4; rows are x and columns y."""
     blocks = images.unflatten(1, (D4.size, -1))[:, D4.quotient[element]].flatten(1, 2)
     blocks = blocks.flip(-1) if D4.flips(element) else blocks
     return blocks.rot90(element % D4.turns, (-2, -1))
 
 
-def test_unusual_inputs_are_left_to_the_dense_convolution():
+def test_unsupported_inputs_fall_back_to_the_dense_convolution():
     dense, fast = layers(2, 2, 1)
     images = images_for(fast)
     assert is_fast(fast, images, pool=True)
@@ -134,7 +132,7 @@ def test_scalars_that_need_a_gradient_get_one():
         assert is_fast(fast, given[0])
 
 
-def test_autocast_is_left_to_the_dense_convolution():
+def test_autocast_falls_back_to_the_dense_convolution():
     dense, fast = layers(2, 2, 1, torch.float32)
     images = images_for(fast)
     with torch.autocast("cpu", torch.bfloat16):
@@ -142,18 +140,18 @@ def test_autocast_is_left_to_the_dense_convolution():
         torch.testing.assert_close(fast(images), dense(images))
 
 
-def test_full_filters_are_dense():
+def test_full_filters_fall_back_to_the_dense_convolution():
     layer = FourierConv2d(D4, 1, 1, 1, full=True)
     assert not is_fast(layer, images_for(layer))
 
 
-def test_types_that_differ_are_refused_as_by_the_dense_convolution():
+def test_mismatched_dtypes_raise_as_in_the_dense_convolution():
     _, fast = layers(2, 2, 1)
     with pytest.raises(RuntimeError, match="type"):
         fast(images_for(fast).float())
 
 
-def test_weights_that_change_are_seen():
+def test_changed_weights_take_effect():
     dense, fast = layers(2, 2, 1)
     images = images_for(fast)
     for mode in (torch.no_grad, torch.inference_mode):
@@ -175,7 +173,7 @@ def test_weights_that_change_are_seen():
     assert fast.weight.grad is not None
 
 
-def test_layers_are_copied_pickled_and_cast():
+def test_layers_can_be_copied_pickled_and_cast():
     dense, fast = layers(2, 2, 1, torch.float32)
     images = images_for(fast)
     assert list(fast.state_dict()) == list(dense.state_dict())
@@ -186,7 +184,7 @@ def test_layers_are_copied_pickled_and_cast():
         assert_near(fast.double()(images.double()), dense.double()(images.double()))
 
 
-def test_python_threads_do_not_disturb_each_other():
+def test_concurrent_python_threads_get_the_same_results():
     pairs = [layers(2, fields, 1) for fields in (2, 3)]
     images = [images_for(pair[0], batch=4, height=32, width=32) for pair in pairs]
     expected = [fast(given, True) for (_, fast), given in zip(pairs, images, strict=True)]
@@ -198,18 +196,18 @@ def test_python_threads_do_not_disturb_each_other():
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_forked_processes_have_threads_of_their_own():
+def test_forked_processes_start_new_threads():
     assert sum(map(len, square_in_threads())) == 4
     with multiprocessing.get_context("fork").Pool(1) as pool:
-        found = pool.apply_async(square_in_threads).get(timeout=60)
-    assert sorted(chain.from_iterable(found)) == [0, 1, 4, 9]
+        actual = pool.apply_async(square_in_threads).get(timeout=60)
+    assert sorted(chain.from_iterable(actual)) == [0, 1, 4, 9]
 
 
 @pytest.mark.skipif(not torch.backends.mkl.is_available(), reason="this PyTorch has no MKL")
-def test_products_in_a_thread_start_no_others():
-    """MKL's number of threads is the process's: with two of ours it had four on two cores."""
-    found = in_threads(lambda found, _: found.append(mkl_threads()), range(2), list)
-    assert found == [["1"], ["1"]]
+def test_matrix_products_in_a_worker_thread_start_no_further_threads():
+    """MKL's number of threads is the process's: with two workers there were four threads on two cores."""
+    actual = in_threads(lambda results, _: results.append(mkl_threads()), range(2), list)
+    assert actual == [["1"], ["1"]]
     assert mkl_threads() == "2"
 
 
@@ -218,10 +216,10 @@ def mkl_threads():
 
 
 def square_in_threads():
-    return in_threads(lambda found, task: found.append(task**2), range(4), list)
+    return in_threads(lambda results, task: results.append(task**2), range(4), list)
 
 
-def test_blocks_cover_every_pixel_once_and_share_a_single_image():
+def test_blocks_cover_every_pixel_once_and_split_a_single_image():
     for batch, side, pool in [(1, 64, True), (1, 6, False), (7, 8, True), (2, 128, True), (5, 3, False)]:
         plan = Plan(torch.empty(batch, 32, side, side), D4.size, 4, 1, pool)
         covered = np.zeros((batch, side), int)

@@ -1,4 +1,4 @@
-"""`symview-train-rl` as a user runs it: learning, stopping, going on, and what LeRobot makes of its checkpoints."""
+"""`symview-train-rl` end to end: training, interruption, resumption, and its checkpoints in LeRobot's commands."""
 
 import json
 import os
@@ -17,9 +17,9 @@ from lerobot_policy_symview.equivariance import assert_equivariant
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
-from lerobot_policy_symview.rl.demonstrations import open_dataset, outcomes
+from lerobot_policy_symview.rl.demonstrations import open_dataset, rewards_and_ends
 from lerobot_policy_symview.rl.learner import WEIGHTS
-from lerobot_policy_symview.rl.records import read_table
+from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.replay import ReplayConfig
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.long
 
 def make_config(recorded, folder, **options):
     policy = SymviewSacfdConfig(device="cpu", width=16, crop_size=64, **options.pop("policy", {}))
-    stated = {"steps": 6, "batch_size": 8, "num_simulators": 2, "eval_every": 3, "eval_episodes": 3, "log_every": 2}
+    defaults = {"steps": 6, "batch_size": 8, "num_simulators": 2, "eval_every": 3, "eval_episodes": 3, "log_every": 2}
     config = TrainRlConfig(
         dataset=RecordedDataset("test/recorded", recorded),
         env=options.pop("env", EnvSettings(max_steps=4)),
@@ -43,11 +43,11 @@ def make_config(recorded, folder, **options):
         output_dir=folder,
         save_every=100,
     )
-    return replace(config, **stated | options)
+    return replace(config, **defaults | options)
 
 
 def state_of(checkpoint):
-    """Everything a checkpoint holds that another run of the same seed must hold too."""
+    """Return everything in a checkpoint that another run of the same seed must have bit-identically."""
     weights = load_file(checkpoint / "pretrained_model" / "model.safetensors")
     weights |= {f"learner.{name}": value for name, value in load_file(checkpoint / "training_state" / WEIGHTS).items()}
     for name in ("actor", "critic", "temperature"):
@@ -60,18 +60,18 @@ def assert_same_run(one, other):
     (weights, state), (other_weights, other_state) = state_of(one), state_of(other)
     assert weights.keys() == other_weights.keys()
     assert [name for name in weights if not torch.equal(weights[name], other_weights[name])] == []
-    assert json.dumps(state) == json.dumps(other_state)  # nan is not equal to itself
+    assert json.dumps(state) == json.dumps(other_state)  # as text, since nan is not equal to itself
     for table in ("training.csv", "evaluation.csv"):
         assert (one.parent.parent / table).read_bytes() == (other.parent.parent / table).read_bytes()
 
 
 @pytest.fixture(scope="module")
 def whole(recorded, tmp_path_factory):
-    """A run without interruption."""
+    """An uninterrupted run."""
     return train_rl(make_config(recorded, tmp_path_factory.mktemp("rl") / "whole"))
 
 
-def test_a_run_leaves_tables_and_a_policy(whole):
+def test_a_run_writes_metrics_and_a_policy(whole):
     folder = whole.parent.parent
     training, evaluation = read_table(folder / "training.csv"), read_table(folder / "evaluation.csv")
     assert [row["step"] for row in training] == [2, 4, 6]
@@ -83,16 +83,16 @@ def test_a_run_leaves_tables_and_a_policy(whole):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_acts_and_learns_beside_simulators(method, recorded, tmp_path):
+def test_every_method_trains_in_simulators(method, recorded, tmp_path):
     env = EnvSettings(max_steps=2, oracle=method == "oracle_equi")
     config = make_config(recorded, tmp_path, env=env, policy={"method": method}, batch_size=4)
     with Training(config, open_dataset(config.dataset)) as training:
-        training.begin()
+        training.start()
         for _ in range(3):
             training.joint_step()
-        assert training.interval.updates == 3
-        assert len(training.interval.success) == 2
-        assert set(training.replay._frames) == set(training.policy.scene.keys)
+        assert training.window.updates == 3
+        assert len(training.window.success) == 2
+        assert set(training.replay.frames) == set(training.policy.scene.keys)
 
 
 def test_lerobot_train_fits_the_actor_to_demonstrations(recorded, tmp_path, monkeypatch):
@@ -101,12 +101,12 @@ def test_lerobot_train_fits_the_actor_to_demonstrations(recorded, tmp_path, monk
     assert SymviewSacfdPolicy.from_pretrained(checkpoint).config.augmentation == "o2"
 
 
-def test_lerobot_eval_finds_what_the_training_found(whole, recorded, monkeypatch, tmp_path):
-    """Same scenes, same policy: the same successes, from the checkpoint and LeRobot's own loop."""
+def test_lerobot_eval_reproduces_the_evaluation_of_the_training(whole, recorded, monkeypatch, tmp_path):
+    """The same policy on the same scenes has the same successes in LeRobot's own loop."""
     config = make_config(recorded, whole.parent.parent)
     with Training(config, open_dataset(config.dataset)) as training:
         training.policy.load_state_dict(SymviewSacfdPolicy.from_pretrained(whole / "pretrained_model").state_dict())
-        found = training.evaluate()
+        evaluation = training.evaluate()
     argv = [
         "lerobot-eval", f"--policy.path={whole / 'pretrained_model'}", "--env.type=symview", "--env.max_steps=4",
         "--eval.n_episodes=3", "--eval.batch_size=1", f"--output_dir={tmp_path}", "--policy.device=cpu",
@@ -115,11 +115,11 @@ def test_lerobot_eval_finds_what_the_training_found(whole, recorded, monkeypatch
     lerobot_eval.main()
     overall = json.loads((tmp_path / "eval_info.json").read_text())["overall"]
     assert overall["n_episodes"] == 3
-    assert overall["pc_success"] / 100 == pytest.approx(found.success_rate)
+    assert overall["pc_success"] / 100 == pytest.approx(evaluation.success_rate)
 
 
-def test_a_run_that_is_stopped_and_resumed_is_the_run_without_interruption(recorded, whole, tmp_path, monkeypatch):
-    """Ctrl-C in the middle of an episode and of a row of the log; resumed twice."""
+def test_a_resumed_run_is_bit_identical_to_the_uninterrupted_one(recorded, whole, tmp_path, monkeypatch):
+    """Ctrl-C in the middle of an episode and of a metrics window; resumed twice."""
     real, steps, handler = Training.joint_step, [], signal.getsignal(signal.SIGINT)
 
     def joint_step(self):
@@ -142,8 +142,8 @@ def test_a_run_that_is_stopped_and_resumed_is_the_run_without_interruption(recor
     assert signal.getsignal(signal.SIGINT) is handler  # Python's own, or none in a shell's background
 
 
-def test_an_interrupted_checkpoint_does_not_count(recorded, whole, tmp_path, monkeypatch):
-    """Killed while it writes the second checkpoint, a run goes on from the first."""
+def test_an_incomplete_checkpoint_is_ignored(recorded, whole, tmp_path, monkeypatch):
+    """A run that is killed while it writes the second checkpoint resumes from the first."""
     config = make_config(recorded, tmp_path / "killed", save_every=2)
     real = command.save_checkpoint
 
@@ -159,20 +159,20 @@ def test_an_interrupted_checkpoint_does_not_count(recorded, whole, tmp_path, mon
     assert_same_run(train_rl(replace(config, resume=True)), whole)
 
 
-def test_frames_on_disk_are_the_same_frames(recorded, whole, tmp_path):
+def test_frames_on_disk_give_the_same_run(recorded, whole, tmp_path):
     config = make_config(recorded, tmp_path / "disk", replay=ReplayConfig(memory_limit_gb=0.0))
     checkpoint = train_rl(config)
     assert (config.output_dir / "replay").is_dir()
     assert_same_run(checkpoint, whole)
 
 
-def test_a_simulator_that_dies_costs_its_episode(recorded, tmp_path, monkeypatch, caplog):
+def test_a_simulator_that_dies_is_replaced_and_its_episode_counted_as_lost(recorded, tmp_path, monkeypatch, caplog):
     real = Training.joint_step
 
     def joint_step(self):
         if self.step == 2:
-            os.kill(self._simulators.process_ids[1], signal.SIGKILL)
-            while self._simulators.is_alive(1):
+            os.kill(self.simulators.process_ids[1], signal.SIGKILL)
+            while self.simulators.is_alive(1):
                 pass
         real(self)
 
@@ -185,33 +185,33 @@ def test_a_simulator_that_dies_costs_its_episode(recorded, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_time_outs_are_followed_by_what_was_seen_last_unless_they_are_terminal(recorded, tmp_path, terminal):
+def test_time_outs_bootstrap_from_the_last_observation_unless_terminal(recorded, tmp_path, terminal):
     config = make_config(recorded, tmp_path, policy={"timeouts_are_terminal": terminal})
     with Training(config, open_dataset(config.dataset)) as training:
-        training.begin()
+        training.start()
         before = len(training.replay)
         for _ in range(5):
             training.joint_step()
         replay = training.replay
         first = replay.slots - 2 * (config.steps + config.steps // 4 + 2)
-        ends = replay._columns["terminal"][first : first + 6].tolist()
-        acted = (replay._columns["chance"][first : first + 6] > 0).tolist()
-        state = replay._frames[keys.STATE][first : first + 6]
+        ends = replay.columns["terminal"][first : first + 6].tolist()
+        acted = (replay.columns["priority"][first : first + 6] > 0).tolist()
+        state = replay.frames[keys.STATE][first : first + 6]
     assert len(replay) == before + 10
     assert ends == [False, False, False, terminal, False, False]
     assert acted == [True] * 4 + ([True, False] if terminal else [False, True])
     assert abs(state[4] - state[0]).max() > 1e-3 or terminal
 
 
-def test_demonstrations_are_remembered_as_they_were_recorded(recorded, tmp_path):
+def test_the_replay_holds_the_demonstrations_as_recorded(recorded, tmp_path):
     config = make_config(recorded, tmp_path)
     dataset = open_dataset(config.dataset)
-    reward, ends, succeeds = outcomes(dataset)
+    reward, ends, succeeds = rewards_and_ends(dataset)
     assert reward.sum() == ends.sum() == succeeds.sum() == 2
     with Training(config, dataset) as training:
-        training.begin()
+        training.start()
         assert len(training.replay) == len(dataset)
-        columns, frames = training.replay._columns, training.replay._frames
+        columns, frames = training.replay.columns, training.replay.frames
         for index in (0, 3, len(dataset) - 1):
             assert (frames[keys.STATE][index] == dataset[index][keys.STATE].numpy()).all()
             physical = training.policy.physical(torch.from_numpy(columns["action"][index]))
@@ -220,22 +220,21 @@ def test_demonstrations_are_remembered_as_they_were_recorded(recorded, tmp_path)
         assert frames["observation.images.side_reproj"].shape[1:] == (3, 76, 76)
 
 
-def test_a_view_in_the_dataset_is_what_simulators_make(with_views, tmp_path):
-    """The dataset's first frame, made offline, is the first frame of a simulator with its seed."""
+def test_views_of_the_dataset_and_of_simulators_are_bit_identical(with_views, tmp_path):
+    """The dataset's first frame, made offline, is a simulator's first frame for the same seed."""
     from symview_sim.demonstration import episode_seed
     from symview_sim.simulators import Reset
 
     config = make_config(with_views, tmp_path)
     with Training(config, open_dataset(config.dataset)) as training:
-        training.begin()
-        training._simulators.send(0, Reset(episode_seed(0, 0)))
-        seen = training._simulators.receive(0).observation
-        packed = training._pack(seen)
+        training.start()
+        training.simulators.send(0, Reset(episode_seed(0, 0)))
+        packed = training.pack(training.simulators.receive(0).observation)
         for name, image in packed.items():
-            assert (training.replay._frames[name][0] == image).all()
+            assert (training.replay.frames[name][0] == image).all()
 
 
-def test_weights_and_biases_gets_the_tables_without_a_network(recorded, tmp_path):
+def test_weights_and_biases_logs_the_metrics_offline(recorded, tmp_path):
     config = make_config(recorded, tmp_path / "run", wandb=WandBConfig(enable=True, mode="offline"))
     checkpoint = train_rl(config)
     (run,) = (tmp_path / "run" / "wandb").glob("offline-run-*/run-*.wandb")
@@ -246,18 +245,18 @@ def test_weights_and_biases_gets_the_tables_without_a_network(recorded, tmp_path
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "holds a training: use --resume=true"),
-        ({"resume": True, "seed": 3}, "begun with other flags: --seed is 3, was 0"),
+        ({}, "already has a run: use --resume=true"),
+        ({"resume": True, "seed": 3}, "started with other flags: --seed is 3, was 0"),
         ({"resume": True, "policy": {"learning_rate": 0.5}}, r"--policy.learning_rate is 0.5, was 0.001"),
     ],
     ids=str,
 )
-def test_an_output_folder_that_does_not_fit_is_refused(recorded, whole, options, message):
+def test_an_output_folder_with_a_different_run_is_refused(recorded, whole, options, message):
     with pytest.raises(SymviewError, match=message):
         train_rl(make_config(recorded, whole.parent.parent, **options))
 
 
-def test_nothing_to_resume_and_nothing_to_learn_from_are_told(recorded, tmp_path):
+def test_a_missing_checkpoint_and_a_missing_dataset_are_reported(recorded, tmp_path):
     with pytest.raises(SymviewError, match=r"no checkpoint in .* to resume from: leave out --resume=true"):
         train_rl(make_config(recorded, tmp_path / "empty", resume=True))
     with pytest.raises(SymviewError, match=r"there is no dataset in .*--dataset.root"):
@@ -269,11 +268,11 @@ def test_nothing_to_resume_and_nothing_to_learn_from_are_told(recorded, tmp_path
     [
         ({"steps": 0}, "--steps must be at least 1, got 0"),
         ({"seed": -1}, "--seed must not be negative"),
-        ({"policy": {"method": "oracle_equi"}}, "sees the camera top: use --env.oracle=true"),
+        ({"policy": {"method": "oracle_equi"}}, "needs the camera 'top': use --env.oracle=true"),
     ],
     ids=str,
 )
-def test_wrong_flags_are_named(recorded, tmp_path, options, message):
+def test_errors_name_the_invalid_flag(recorded, tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
         make_config(recorded, tmp_path, **options)
 
@@ -281,27 +280,27 @@ def test_wrong_flags_are_named(recorded, tmp_path, options, message):
 @pytest.mark.parametrize(
     ("env", "policy", "message"),
     [
-        (EnvSettings(task="drawer_opening"), {}, "--env.task is 'drawer_opening', theirs is 'block_picking'"),
-        (EnvSettings(camera=CameraSpec(elevation_deg=30)), {}, "--env.camera.elevation_deg is 30, theirs is 45"),
+        (EnvSettings(task="drawer_opening"), {}, "--env.task is 'drawer_opening', the dataset has 'block_picking'"),
+        (EnvSettings(camera=CameraSpec(elevation_deg=30)), {}, "--env.camera.elevation_deg is 30, the dataset has 45"),
         (EnvSettings(), {"camera": "left"}, "--policy.camera=left is not simulated; --env.camera.name is 'side'"),
     ],
     ids=str,
 )
-def test_demonstrations_of_another_scene_are_refused(recorded, tmp_path, env, policy, message):
+def test_demonstrations_of_a_different_scene_are_refused(recorded, tmp_path, env, policy, message):
     with pytest.raises(ValueError, match=message):
         train_rl(make_config(recorded, tmp_path, env=env, policy=policy))
 
 
 @pytest.mark.parametrize(
-    "options", [{"discount": 0.0}, {"target_rate": 1.5}, {"initial_temperature": 0.0}, {"target_interval": 0},
-                {"expert_weight": -1.0}, {"target_update": "soft"}], ids=str,
+    "options", [{"discount": 0.0}, {"target_tau": 1.5}, {"initial_temperature": 0.0}, {"target_interval": 0},
+                {"bc_weight": -1.0}, {"target_update": "soft"}], ids=str,
 )  # fmt: skip
-def test_wrong_options_of_the_policy_are_named(options):
+def test_errors_name_the_invalid_policy_option(options):
     with pytest.raises(ValueError, match=f"--policy.{next(iter(options))}"):
         SymviewSacfdConfig(device="cpu", **options)
 
 
-def test_the_command_reports_a_mistake_in_one_line(monkeypatch, capsys, tmp_path):
+def test_the_command_reports_an_error_in_one_line(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(sys, "argv", ["symview-train-rl", f"--dataset.root={tmp_path}", "--policy.method=reproj_equi"])
     with pytest.raises(SystemExit) as end:
         command.main()

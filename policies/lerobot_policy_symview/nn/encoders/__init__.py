@@ -1,1 +1,1 @@
-"""Encoders of images, voxels and point clouds."""
+"""Encoders of images, voxel grids and point clouds, and their registry."""

@@ -1,4 +1,4 @@
-"""What every encoder is: a map from a picture and a state to equivariant features."""
+"""The base class of all encoders."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from lerobot_policy_symview.symmetry.groups import PlanarGroup
 
 
 class Encoder(nn.Module):
-    """Maps pictures and states (B, D) to features (B, G, n): n fields with their group axis, which a head may keep.
+    """Maps observations and states (B, D) to n regular fields (B, G, n).
+
+    Subclasses define `forward(observation, state)`. Heads get the features with their group axis.
 
     Args:
         group: G elements.
@@ -20,5 +22,5 @@ class Encoder(nn.Module):
         self.group, self.fields = group, fields
 
     def split(self, channels: Tensor) -> Tensor:
-        """Give channels (B, G n, ...) of one pixel their group axis: (B, G, n)."""
+        """Split channels (B, G n, ...) of a single pixel into regular fields (B, G, n)."""
         return channels.reshape(len(channels), self.group.size, self.fields)

@@ -1,6 +1,6 @@
-"""The encoders of images and voxels, and the registry `--policy.encoder` chooses from.
+"""Convolutional encoders of images and voxel grids.
 
-The plain network is the equivariant one's layout for the group of one element.
+The plain encoder has the layout of the equivariant encoder for the trivial group.
 """
 
 from __future__ import annotations
@@ -22,27 +22,28 @@ from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
 
 CHANNELS_LAST = {2: torch.channels_last, 3: torch.channels_last_3d}
 Convolution = Callable[[PlanarGroup, int | NDArray[np.float64], int, int], nn.Module]
+"""Makes a layer from a group, its input (a number of fields, or a representation), its output fields and a padding."""
 
 
 class ConvolutionalEncoder(Encoder):
-    """Convolutions, some followed by the maximum of 2 pixels along every axis, each by ReLU, down to one pixel.
+    """Convolutions with ReLU, some of them with 2 x 2 (x 2) max pooling, down to a single pixel.
 
     Args:
         group: G elements.
-        fields: n.
-        layers: the convolutions; with a second argument True they append maximum and ReLU.
-        pooled: which of them do.
+        fields: n, of the last convolution.
+        layers: the convolutions; called with a second argument True, they append max pooling and ReLU.
+        pooled: for each convolution, whether it is pooled.
     """
 
     def __init__(self, group: PlanarGroup, fields: int, layers: Sequence[nn.Module], pooled: Sequence[bool]):
         super().__init__(group, fields)
         self.layers, self.pooled = nn.ModuleList(layers), list(pooled)
 
-    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Map pictures (B, C, size, size), or voxels (B, C, Z, X, Y), and states (B, D) to features (B, G, n)."""
-        shape = picture.shape[2:]
-        constants = state.reshape(*state.shape, *[1] * len(shape)).expand(-1, -1, *shape)
-        features = torch.cat([picture, constants], dim=1)
+    def forward(self, observation: Tensor, state: Tensor) -> Tensor:
+        """Map images (B, C, size, size), or voxel grids (B, C, Z, X, Y), and states (B, D) to features (B, G, n)."""
+        shape = observation.shape[2:]
+        state_channels = state.reshape(*state.shape, *[1] * len(shape)).expand(-1, -1, *shape)
+        features = torch.cat([observation, state_channels], dim=1)
         if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
             features = features.contiguous(memory_format=CHANNELS_LAST[len(shape)])
         for layer, pool in zip(self.layers, self.pooled, strict=True):
@@ -53,15 +54,15 @@ class ConvolutionalEncoder(Encoder):
 
 
 class ImageEncoder(ConvolutionalEncoder):
-    """Seven convolutions from 128 px to one, six from 64 px (paper A.4; 1,112,680 parameters for five channels).
+    """Seven 3 x 3 convolutions for 128 px, six for 64 px (paper A.4; 1,112,680 parameters for five channels).
 
     Args:
         group: G elements.
-        channels: of the picture, each a scalar field on the table.
-        state: (G, D, D), the representation of the state, which every pixel gets.
-        stages: fields of the convolutions that each halve the image, down to 8 px.
-        fields: of the last three convolutions.
-        convolution: makes a layer of a group, inputs, fields and padding.
+        channels: image channels, each in the trivial representation.
+        state: (G, D, D), representation of the state vector, which is repeated at every pixel.
+        stages: output fields of the convolutions that are pooled, down to 8 px.
+        fields: output fields of the last three convolutions.
+        convolution: makes the layers.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class ImageEncoder(ConvolutionalEncoder):
         fields: tuple[int, int, int],
         convolution: Convolution = FieldConv2d,
     ):
-        inputs: list[int | NDArray[np.float64]] = [scalars(group, channels, state), *stages, *fields[:-1]]
+        inputs: list[int | NDArray[np.float64]] = [with_trivial(group, channels, state), *stages, *fields[:-1]]
         paddings = [1] * (len(stages) + 1) + [0, 0]
         layers = [
             convolution(group, before, after, padding)
@@ -83,29 +84,61 @@ class ImageEncoder(ConvolutionalEncoder):
 
 
 class VoxelEncoder(ConvolutionalEncoder):
-    """The image encoder in three dimensions, for 32 x 64 x 64 voxels; turns and mirrors move the last two axes.
+    """The image encoder in three dimensions, for grids of 32 x 64 x 64 voxels; the group acts on the last two axes.
 
     Args:
         group: G elements.
-        state: (G, D, D), the representation of the state, which every voxel gets.
+        state: (G, D, D), representation of the state vector, which is repeated at every voxel.
         width: n of the corresponding image encoder; 64 gives 1.18 M parameters.
     """
 
     def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
         fields = [width // 16, width // 8, width // 4, width // 2, width, width // 2, width // 2]
-        inputs: list[int | NDArray[np.float64]] = [scalars(group, VOXEL_CHANNELS, state), *fields[:-1]]
+        inputs: list[int | NDArray[np.float64]] = [with_trivial(group, VOXEL_CHANNELS, state), *fields[:-1]]
         paddings = [(1, 1, 1)] * 5 + [(1, 0, 0), (0, 0, 0)]
-        heights = [3] * 6 + [2]
+        depths = [3] * 6 + [2]
         layers = [
-            FieldConv3d(group, before, after, padding, height)
-            for before, after, padding, height in zip(inputs, fields, paddings, heights, strict=True)
+            FieldConv3d(group, before, after, padding, depth)
+            for before, after, padding, depth in zip(inputs, fields, paddings, depths, strict=True)
         ]
         super().__init__(group, fields[-1], layers, [True, True, True, False, False, True, False])
 
 
-def scalars(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the representation of `count` scalars followed by `others` (G, D, D)."""
+def with_trivial(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the direct sum of `count` trivial representations and `others` (G, D, D)."""
     return block_diagonal([np.ones((group.size, 1, 1))] * count + [others])
+
+
+def equivariant(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the paper's equivariant encoder, in the Fourier domain on a CPU."""
+    return _image_encoder(config, group, state, FourierConv2d)
+
+
+def relaxed(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder of relaxed group convolutions, which training may make less than equivariant."""
+    return _image_encoder(config, group, state, RelaxedConv2d)
+
+
+def plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder without symmetry.
+
+    At the paper's size it has 16, 32, 64, 128, 128, 256, 256 channels and 1.13 M parameters.
+    """
+    stages = [2 * fields for fields in _stages(config)]
+    fields = (2 * config.width, 4 * config.width, 4 * config.width)
+    return ImageEncoder(group, config.channels, state, stages, fields, _unconstrained)
+
+
+def voxel(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
+    """Return the encoder of voxel grids."""
+    return VoxelEncoder(group, state, config.width)
+
+
+def _image_encoder(
+    config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64], convolution: Convolution
+) -> Encoder:
+    fields = (2 * config.width, config.width, config.width)
+    return ImageEncoder(group, config.channels, state, _stages(config), fields, convolution)
 
 
 def _stages(config: SymviewConfig) -> list[int]:
@@ -113,29 +146,5 @@ def _stages(config: SymviewConfig) -> list[int]:
     return {128: [n // 8, n // 4, n // 2, n], 64: [n // 4, n // 2, n]}[config.crop_size]
 
 
-def _full(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, padding: int) -> FieldConv2d:
+def _unconstrained(group: PlanarGroup, inputs: int | NDArray[np.float64], fields: int, padding: int) -> FieldConv2d:
     return FieldConv2d(group, inputs, fields, padding, full=True)
-
-
-def equivariant(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the equivariant image encoder."""
-    fields = (2 * config.width, config.width, config.width)
-    return ImageEncoder(group, config.channels, state, _stages(config), fields, FourierConv2d)
-
-
-def relaxed(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the image encoder of relaxed group convolutions."""
-    fields = (2 * config.width, config.width, config.width)
-    return ImageEncoder(group, config.channels, state, _stages(config), fields, RelaxedConv2d)
-
-
-def plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the lineage's 16, 32, 64, 128, 128, 256, 256 channels at the paper's size: 1.13 M parameters."""
-    stages = [2 * fields for fields in _stages(config)]
-    fields = (2 * config.width, 4 * config.width, 4 * config.width)
-    return ImageEncoder(group, config.channels, state, stages, fields, _full)
-
-
-def voxel(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the encoder of voxels."""
-    return VoxelEncoder(group, state, config.width)

@@ -1,4 +1,4 @@
-"""PointNet++ (Qi et al., 2017) with equivariant layers (paper A.4)."""
+"""The encoder of point clouds: PointNet++ (Qi et al., 2017) with equivariant layers (paper A.4)."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
 
-POINTS = 1024
-UNIT = 0.1  # metres: what coordinates are divided by, so that they are of the order of one
+POINTS = 1024  # per cloud
+UNIT = 0.1  # metres; coordinates are divided by it, so that they are of the order of one
 
 
 class PointEncoder(Encoder):
-    """Three set abstractions at two scales and one over all points; 1.2 M parameters at width 64.
+    """Three set abstractions at two scales, then a global set abstraction; 1.2 M parameters at width 64.
 
     Args:
         group: G elements.
-        state: (G, D, D), the representation of the state, which every point gets.
-        width: of the last set abstraction, in fields.
+        state: (G, D, D), representation of the state vector, which is repeated at every point.
+        width: n, output fields of the global set abstraction.
     """
 
     def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
@@ -40,49 +40,49 @@ class PointEncoder(Encoder):
                 SetAbstraction(group, 2 * width, 16, (0.12, 0.24), 16, (width, 3 * width // 2, 2 * width)),
             ]
         )
-        self.whole = FieldMlp(group, 4 * width, (2 * width, 4 * width, width))
+        self.global_mlp = FieldMlp(group, 4 * width, (2 * width, 4 * width, width))
 
-    def forward(self, points: Tensor, state: Tensor) -> Tensor:
-        """Map points (B, P, 6) of x, y, z in metres and colour, and states (B, D), to features (B, G, n)."""
-        position = points[..., :3] / UNIT
-        features = torch.cat([points[..., 3:], state[:, None].expand(-1, points.shape[1], -1)], dim=-1)
+    def forward(self, observation: Tensor, state: Tensor) -> Tensor:
+        """Map points (B, P, 6), x, y, z in metres and RGB, and states (B, D) to features (B, G, n)."""
+        position = observation[..., :3] / UNIT
+        features = torch.cat([observation[..., 3:], state[:, None].expand(-1, observation.shape[1], -1)], dim=-1)
         for abstraction in self.abstractions:
             position, features = abstraction(position, features)
-        pooled = self.whole(features, position).amax(dim=1)
+        pooled = self.global_mlp(features, position).amax(dim=1)
         return self.split(pooled)
 
 
 class FieldMlp(nn.Module):
-    """Equivariant layers with ReLU of features and, in the first, an offset (x, y, z)."""
+    """Equivariant multi-layer perceptron with ReLU, of a point's features and its offset (x, y, z) from a centre."""
 
     def __init__(self, group: PlanarGroup, inputs: int | NDArray[np.float64], fields: Sequence[int]):
         super().__init__()
         offset = block_diagonal([group.rotation(), np.ones((group.size, 1, 1))])
-        self.of_offset = FieldLinear(group, offset, fields[0])
-        self.of_features = FieldLinear(group, inputs, fields[0])
-        self.rest = nn.ModuleList(FieldLinear(group, before, after) for before, after in itertools.pairwise(fields))
+        self.from_offset = FieldLinear(group, offset, fields[0])
+        self.from_features = FieldLinear(group, inputs, fields[0])
+        self.layers = nn.ModuleList(FieldLinear(group, before, after) for before, after in itertools.pairwise(fields))
 
     def forward(self, features: Tensor, offset: Tensor, index: Tensor | None = None) -> Tensor:
-        """Map features (B, P, channels), chosen by `index` (B, ...), and offsets (B, ..., 3) to (B, ..., G fields)."""
-        chosen = self.of_features(features)
-        if index is not None:  # after the linear map, which commutes with choosing: points are fewer than neighbours
-            chosen = _rows(chosen, index)
-        hidden = functional.relu(chosen + self.of_offset(offset))
-        for layer in self.rest:
+        """Map features (B, P, channels), gathered at `index` (B, ...), and offsets (B, ..., 3) to (B, ..., G n)."""
+        gathered = self.from_features(features)
+        if index is not None:  # after the linear map, which commutes with it: there are fewer points than neighbours
+            gathered = _gather(gathered, index)
+        hidden = functional.relu(gathered + self.from_offset(offset))
+        for layer in self.layers:
             hidden = functional.relu(layer(hidden))
         return hidden
 
 
 class SetAbstraction(nn.Module):
-    """Summarises the neighbourhoods of some of the points, at several radii (multi-scale grouping).
+    """Set abstraction with multi-scale grouping: max pooling over the neighbourhoods of sampled points.
 
     Args:
         group: G elements.
-        inputs: of the points' features, as for the layers.
-        centers: how many points are kept, each as far as possible from those before.
-        radii: of the neighbourhoods, metres.
-        neighbors: how many points a neighbourhood has at most.
-        fields: of the layers, for each radius.
+        inputs: number of input fields, or the representation of the input channels, as for `FieldLayer`.
+        centers: number of points that farthest point sampling keeps.
+        radii: radii of the neighbourhoods, metres.
+        neighbors: most points of a neighbourhood.
+        fields: output fields of each layer, the same for every radius.
     """
 
     def __init__(
@@ -99,36 +99,36 @@ class SetAbstraction(nn.Module):
         self.scales = nn.ModuleList(FieldMlp(group, inputs, fields) for _ in radii)
 
     def forward(self, position: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Map positions (B, P, 3) and features (B, P, channels) to the centres', the scales' fields side by side."""
-        centers = _rows(position, farthest_points(position, self.centers))
+        """Map positions (B, P, 3) and features (B, P, channels) to those of the centres; scales' fields are joined."""
+        centers = _gather(position, farthest_points(position, self.centers))
         squared = _squared_distances(centers, position)
         nearest_first = squared.topk(self.neighbors, dim=-1, largest=False)
-        summaries = []
+        pooled_scales = []
         for radius, mlp in zip(self.radii, self.scales, strict=True):
             index = neighborhoods(nearest_first, radius / UNIT)
-            offset = _rows(position, index) - centers[:, :, None]
-            summary = mlp(features, offset, index).amax(dim=2)
-            summaries.append(summary.view(*summary.shape[:2], self.group.size, -1))
-        return centers, torch.cat(summaries, dim=-1).flatten(-2)
+            offset = _gather(position, index) - centers[:, :, None]
+            pooled = mlp(features, offset, index).amax(dim=2)
+            pooled_scales.append(pooled.view(*pooled.shape[:2], self.group.size, -1))
+        return centers, torch.cat(pooled_scales, dim=-1).flatten(-2)
 
 
 def farthest_points(position: Tensor, count: int) -> Tensor:
-    """Choose `count` of the points (B, P, 3), the first and then each the farthest from those chosen: (B, count)."""
+    """Return the indices (B, count) of a farthest point sample of points (B, P, 3) that starts at the first point."""
     chosen = [torch.zeros(len(position), dtype=torch.long, device=position.device)]
     nearest = position.new_full(position.shape[:2], torch.inf)
     for _ in range(count - 1):
-        last = _rows(position, chosen[-1][:, None])
+        last = _gather(position, chosen[-1][:, None])
         nearest = torch.minimum(nearest, _squared_distances(last, position)[:, 0])
         chosen.append(nearest.argmax(dim=1))
     return torch.stack(chosen, dim=1)
 
 
 def neighborhoods(nearest_first: tuple[Tensor, Tensor], radius: float) -> Tensor:
-    """Return the points within `radius` of each centre, the nearest in place of those beyond.
+    """Return the points within `radius` of each centre (ball query); the nearest one replaces those beyond.
 
     Args:
-        nearest_first: squared distances (B, C, K) in ascending order, and the points they belong to.
-        radius: in the unit of the distances' roots.
+        nearest_first: squared distances (B, C, K) in ascending order, and the indices of their points.
+        radius: in the unit of the positions.
 
     Returns:
         (B, C, K) indices of points.
@@ -138,12 +138,15 @@ def neighborhoods(nearest_first: tuple[Tensor, Tensor], radius: float) -> Tensor
 
 
 def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
-    """(B, A, 3) and (B, P, 3) to (B, A, P), by differences: a quarter turn changes no bit, unlike a matrix product."""
+    """Return (B, A, P) for points (B, A, 3) and (B, P, 3).
+
+    Differences are bit-identical under quarter turns, which the expansion by a matrix product is not.
+    """
     x, y, z = (a[:, :, None, axis] - b[:, None, :, axis] for axis in range(3))
     return (x * x + y * y) + z * z
 
 
-def _rows(values: Tensor, index: Tensor) -> Tensor:
+def _gather(values: Tensor, index: Tensor) -> Tensor:
     """Return values (B, P, F) at index (B, ...): (B, ..., F)."""
     flat = index.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
     return values.gather(1, flat).view(*index.shape, values.shape[-1])
