@@ -1,8 +1,8 @@
-"""Write a dataset again with both views from above as new camera keys, and draw those of one frame.
+"""Add both top-down views to a dataset as new camera keys, and draw the images of one frame.
 
     python examples/add_views.py --dataset=data/picking
 
-Without --dataset, two demonstrations are recorded first. The source is never changed.
+Without --dataset, two demonstrations are recorded first. The source dataset is not modified.
 """
 
 import argparse
@@ -13,8 +13,7 @@ from lerobot.datasets import LeRobotDataset
 from torchvision.transforms.functional import resize
 from torchvision.utils import save_image
 
-from lerobot_symview import PerspectiveView, ReprojectedView, Workspace, keys
-from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview import AddViewsConfig, ViewSpec, Workspace, add_views, keys
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
@@ -23,17 +22,18 @@ logger = logging.getLogger(__name__)
 
 
 def main(dataset: Path | None, size: int, output_dir: Path) -> None:
-    """Add the views and draw them."""
+    """Add the views and draw one frame."""
     if dataset is None:
         recorded = NewDataset("me/picking", output_dir / "picking")
         dataset = generate(GenerateConfig(recorded, num_episodes=2, resume=True))
     config = AddViewsConfig(
         HubDataset("me/picking", dataset),
         new_root=output_dir / "picking_views",
-        views=["reproj", "persp"],
+        views=[
+            ViewSpec("reproj", {"infill": "nearest", "mask": True}),
+            ViewSpec("persp", {"plane_height": 0.025}),  # metres: half the block's height
+        ],
         size=size,
-        reproj=ReprojectedView(infill="nearest", mask=True),
-        persp=PerspectiveView(plane_height=0.025),  # metres: half the block's height
         resume=True,
     )
     folder = add_views(config)
@@ -43,10 +43,10 @@ def main(dataset: Path | None, size: int, output_dir: Path) -> None:
     images = {name: frame[keys.rgb(name)] for name in names}
     for name, image in images.items():
         logger.info("%-20s %s", name, tuple(image.shape))
-    images["side_reproj_height"] /= Workspace().height_limit  # metres to brightness
-    picture = output_dir / "views.png"
-    save_image([resize(image.expand(3, -1, -1), [size, size]) for image in images.values()], picture)
-    logger.info("drawn in %s", picture)
+    images["side_reproj_height"] /= Workspace().height_limit  # brightness from metres
+    figure = output_dir / "views.png"
+    save_image([resize(image.expand(3, -1, -1), [size, size]) for image in images.values()], figure)
+    logger.info("the figure is %s", figure)
 
 
 if __name__ == "__main__":

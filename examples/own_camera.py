@@ -1,8 +1,8 @@
-"""Add views to a dataset that has no calibration and no gripper's pose: the calibration comes from a file.
+"""Add views to a dataset without calibration and gripper pose; a file provides the calibration.
 
     python examples/own_camera.py --dataset=data/real --calibration=cameras.yaml
 
-Without --dataset, simulated demonstrations are stripped of what yours would lack.
+Without --dataset, demonstrations are simulated and their calibration and state removed.
 """
 
 import argparse
@@ -11,9 +11,7 @@ from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset, remove_feature
 
-from lerobot_symview import CameraSpec, PerspectiveView, ReprojectedView, keys
-from lerobot_symview.calibration.file import read_calibration
-from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview import AddViewsConfig, CameraSpec, ViewSpec, add_views, keys, read_calibration
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
@@ -22,13 +20,13 @@ logger = logging.getLogger(__name__)
 
 
 def record_stand_in(calibration: Path, output_dir: Path) -> Path:
-    """Record with the calibration's camera, leave out what a real robot does not tell, and return the folder."""
+    """Record with the calibration's camera, remove calibration and state, and return the folder."""
     front = read_calibration(calibration).camera("front")
     matrices = {"intrinsics": tuple(front.intrinsics.flat), "world_from_cam": tuple(front.world_from_cam.flat)}
     env = RecordedEnv(camera=CameraSpec("front", front.height, front.width, **matrices), oracle=False)
     folder = generate(GenerateConfig(NewDataset("me/whole", output_dir / "whole"), env, num_episodes=1))
-    told = [keys.intrinsics("front"), keys.world_from_cam("front"), keys.STATE]
-    return remove_feature(LeRobotDataset("me/whole", root=folder), told, output_dir / "real", "me/real").root
+    removed = [keys.intrinsics("front"), keys.world_from_cam("front"), keys.STATE]
+    return remove_feature(LeRobotDataset("me/whole", root=folder), removed, output_dir / "real", "me/real").root
 
 
 def main(dataset: Path | None, calibration: Path, output_dir: Path) -> None:
@@ -36,16 +34,15 @@ def main(dataset: Path | None, calibration: Path, output_dir: Path) -> None:
     config = AddViewsConfig(
         HubDataset("me/real", dataset or record_stand_in(calibration, output_dir)),
         new_root=output_dir / "real_views",
-        views=["reproj", "persp"],
+        # The gripper's height is unknown: clip at 20 cm. No gripper image is drawn.
+        views=[ViewSpec("reproj", {"clip": 0.2, "source_scale": 2}), ViewSpec("persp")],
         camera="front",
         calibration=calibration,
-        reproj=ReprojectedView(clip=0.2, source_scale=2),  # cut at 20 cm, since nobody says where the gripper is
-        persp=PerspectiveView(gripper=False),
     )
-    seen = LeRobotDataset("me/real_views", root=add_views(config))
-    logger.info("%d frames with %s", len(seen), ", ".join(sorted(seen.meta.camera_keys)))
-    x, y, z = seen[0][keys.world_from_cam("front")].reshape(4, 4)[:3, 3].tolist()
-    logger.info("each now says that its camera is at (%.2f, %.2f, %.2f) m", x, y, z)
+    result = LeRobotDataset("me/real_views", root=add_views(config))
+    logger.info("%d frames with %s", len(result), ", ".join(sorted(result.meta.camera_keys)))
+    x, y, z = result[0][keys.world_from_cam("front")].reshape(4, 4)[:3, 3].tolist()
+    logger.info("in the first frame, the camera is at (%.2f, %.2f, %.2f) m", x, y, z)
 
 
 if __name__ == "__main__":

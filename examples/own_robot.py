@@ -1,9 +1,9 @@
-"""Say how the actions and the state of a robot of your own move with the scene, and check that a policy follows.
+"""Declare how your robot's state and action transform with the scene, and check that a policy is equivariant.
 
     python examples/own_robot.py
 
-The robot below turns its tool by a rotation vector. Declared as a vector like (dx, dy), it would turn with the scene as
-it should, and go the wrong way in a mirror image: the errors tell in which motions the declarations differ.
+The robot below rotates its tool by a rotation vector. Declared as an ordinary vector like (dx, dy), it transforms
+correctly under rotations and wrongly under reflections: the errors name the planar transforms that are violated.
 """
 
 import argparse
@@ -25,8 +25,7 @@ WRONG = ACTION | {"roll": "x:tool", "pitch": "y:tool"}
 def make_policy(actions: dict[str, str], width: int) -> SymviewBcPolicy:
     """Return an untrained policy for a dataset of this robot."""
     declared: dict[str, Any] = {"state_symmetry": list(STATE.values()), "action_symmetry": list(actions.values())}
-    # `vector` gives the network the state's numbers; the default draws a gripper whose yaw this state does not tell.
-    declared |= {"gripper_input": "vector"}
+    declared |= {"gripper_input": "vector"}  # the default draws the gripper, whose yaw this state lacks
     config = SymviewBcConfig(device="cpu", camera="front", width=width, crop_size=64, **declared)
     features = {
         "observation.images.front": {"dtype": "image", "shape": (480, 640, 3)},
@@ -34,25 +33,25 @@ def make_policy(actions: dict[str, str], width: int) -> SymviewBcPolicy:
         "observation.state": {"dtype": "float32", "shape": (len(STATE),), "names": list(STATE)},
         "action": {"dtype": "float32", "shape": (len(ACTION),), "names": list(ACTION)},
     }
-    config.set_dataset_feature_metadata(features)  # in training, LeRobot does so with those of the dataset
+    config.set_dataset_feature_metadata(features)  # lerobot-train passes the dataset's features
     torch.manual_seed(0)
     return SymviewBcPolicy(config)
 
 
 def main(width: int) -> None:
-    """Check a policy of the right declaration, and one of the wrong one."""
+    """Check a policy with the correct declaration, and a policy with a wrong one."""
     assert_equivariant(make_policy(ACTION, width))
-    logger.info("declared rightly: equivariant")
+    logger.info("correct declaration: equivariant")
 
     wrong = make_policy(WRONG, width)
-    wrong.config.action_symmetry = list(ACTION.values())  # made for one declaration, held to the other
+    wrong.config.action_symmetry = list(ACTION.values())  # built for one declaration, tested on the other
     for element, error in equivariance_errors(wrong).items():
-        logger.info("declared wrongly, %s: %.0e", describe(checked_group(wrong.config), element), error)
+        logger.info("wrong declaration, %s: %.0e", describe(checked_group(wrong.config), element), error)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--width", type=int, default=16, help="fields of the network; the paper's are 64")
+    parser.add_argument("--width", type=int, default=16, help="regular fields of the network; 64 in the paper")
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)
     main(**vars(parser.parse_args()))

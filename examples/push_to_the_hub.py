@@ -1,9 +1,10 @@
-"""Record a dataset and push it to the Hugging Face Hub with a card, add views to what is pulled, and push those too.
+"""Record a dataset, push it to the Hugging Face Hub, pull it, add views, and push the result. Both get a card.
 
     hf auth login
     python examples/push_to_the_hub.py --repo_id=YOUR_NAME/picking
 
-Both are private until you say otherwise on their pages. An upload that breaks off is gone on with by the same command.
+Both repositories are private until you change this on their pages. After an interrupted upload, run the same command
+again.
 """
 
 import argparse
@@ -12,7 +13,7 @@ from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset

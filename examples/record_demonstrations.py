@@ -1,8 +1,8 @@
-"""Record demonstrations by a task's expert, seen by a camera that stands where you say, and open them with LeRobot.
+"""Record demonstrations of a task's expert with a camera at a position of your choice, and open them with LeRobot.
 
     python examples/record_demonstrations.py --task=drawer_opening --azimuth_deg=120
 
-The camera has a name of its own, the noise of a real depth sensor, and moves a little from episode to episode.
+The camera is named `front`, has the depth noise of a real sensor, and changes its azimuth a little in every episode.
 """
 
 import argparse
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def main(task: str, azimuth_deg: float, episodes: int, output_dir: Path) -> None:
-    """Record, open, and say what is there."""
+    """Record a dataset, open it and print its features."""
     camera = CameraSpec(
         name="front",
         height=120,
@@ -34,7 +34,7 @@ def main(task: str, azimuth_deg: float, episodes: int, output_dir: Path) -> None
         dataset=NewDataset("me/demonstrations", output_dir),
         env=RecordedEnv(task=task, camera=camera, oracle=False),
         num_episodes=episodes,
-        resume=True,  # interrupted, the same command goes on
+        resume=True,  # after an interruption, the same command continues
     )
     folder = generate(config)
 
@@ -45,8 +45,8 @@ def main(task: str, azimuth_deg: float, episodes: int, output_dir: Path) -> None
         logger.info("  %-45s %-8s %s", key, feature["dtype"], tuple(feature["shape"]))
     x, y, z = frame[keys.world_from_cam("front")].reshape(4, 4)[:3, 3].tolist()
     depth = frame[keys.depth("front")]
-    logger.info("in the first frame the camera is at (%.2f, %.2f, %.2f) m", x, y, z)
-    logger.info("and sees what is %.2f to %.2f m away", depth[depth > 0].min(), depth.max())
+    logger.info("in the first frame, the camera is at (%.2f, %.2f, %.2f) m", x, y, z)
+    logger.info("its depth ranges from %.2f to %.2f m", depth[depth > 0].min(), depth.max())
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Soft actor-critic from demonstrations, beside simulators in processes of their own.
+"""Soft actor-critic from demonstrations, with simulators in parallel processes.
 
     python examples/reinforcement_learning.py --steps=1000
 
-By default a short run of a small network, some minutes on two cores; `--steps=1000` learns more. Ctrl-C saves a
-checkpoint and ends it; the same command goes on.
+The default is a short run of a small network: some minutes on two cores. `--steps=1000` learns more. Ctrl-C saves a
+checkpoint and ends the run; the same command continues it.
 """
 
 import argparse
@@ -20,7 +20,7 @@ logger = logging.getLogger(__name__)
 
 
 def main(demonstrations: int, steps: int, simulators: int, episodes: int, output_dir: Path) -> None:
-    """Record demonstrations, train, and show what the evaluations found."""
+    """Record demonstrations, train, and print the evaluation results."""
     dataset = NewDataset("me/picking", output_dir / "picking")
     generate(GenerateConfig(dataset, num_episodes=demonstrations, resume=True))
     config = TrainRlConfig(
@@ -43,9 +43,9 @@ def main(demonstrations: int, steps: int, simulators: int, episodes: int, output
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demonstrations", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=400, help="updates; in each, every simulator takes one action")
+    parser.add_argument("--steps", type=int, default=400, help="updates; every simulator takes one action per update")
     parser.add_argument("--simulators", type=int, default=5)
-    parser.add_argument("--episodes", type=int, default=20, help="of each of four evaluations")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of each of four evaluations")
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/examples/sacfd"))
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)

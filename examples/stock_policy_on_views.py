@@ -1,10 +1,9 @@
-"""Train one of LeRobot's own policies, ACT, on a view as one more camera, and evaluate it by LeRobot's own loop.
+"""Train LeRobot's own ACT policy on a view as another camera, and evaluate it with LeRobot's own loop.
 
     python examples/stock_policy_on_views.py --steps=10000
 
-Nothing of ours is in the policy, which takes images of three channels: the view comes without its height. In the
-evaluation the environment makes the same view of what its camera sees. The default shows the way and is far too short
-for ACT to succeed.
+The policy has none of our code. It takes images of three channels, so the view has no height map. In the evaluation,
+the environment renders the same view. The default number of steps is far too small for ACT to succeed.
 """
 
 import argparse
@@ -20,30 +19,29 @@ from lerobot.scripts.lerobot_eval import eval_main
 from lerobot.scripts.lerobot_train import train
 
 from lerobot_policy_symview import SymviewEnvConfig
-from lerobot_symview import ReprojectedView
-from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview import AddViewsConfig, ViewSpec, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
 logger = logging.getLogger(__name__)
-VIEW = ReprojectedView(size=96, height=False, source_scale=2)
+VIEW = ViewSpec("reproj", {"size": 96, "height": False, "source_scale": 2})
 
 
 def main(demonstrations: int, steps: int, episodes: int, output_dir: Path) -> None:
-    """Record, add the view, train and evaluate."""
+    """Record demonstrations, add the view, train and evaluate."""
     recorded = NewDataset("me/picking", output_dir / "picking")
     source = HubDataset("me/picking", generate(GenerateConfig(recorded, num_episodes=demonstrations, resume=True)))
-    seen = add_views(AddViewsConfig(source, new_root=output_dir / "views", reproj=VIEW, keep=[], resume=True))
+    views = add_views(AddViewsConfig(source, new_root=output_dir / "views", views=[VIEW], keep=[], resume=True))
 
     act = ACTConfig(device="cpu", dim_model=128, n_heads=4, dim_feedforward=256, chunk_size=8, n_action_steps=4)
     act.push_to_hub, act.pretrained_backbone_weights = False, None
-    data = DatasetConfig("me/picking_views", root=str(seen))
+    data = DatasetConfig("me/picking_views", root=str(views))
     output = {"output_dir": output_dir / "act", "env_eval_freq": 0, "log_freq": 50}
     train(TrainPipelineConfig(data, policy=act, steps=steps, batch_size=8, num_workers=0, **output))
 
     act.pretrained_path = output_dir / "act" / "checkpoints" / "last" / "pretrained_model"
-    env, size = SymviewEnvConfig(views=["reproj"], reproj=VIEW), EvalConfig(n_episodes=episodes, batch_size=1)
+    env, size = SymviewEnvConfig(views=[VIEW]), EvalConfig(n_episodes=episodes, batch_size=1)
     eval_main(EvalPipelineConfig(env, size, policy=act, output_dir=output_dir / "evaluation"))
     overall = json.loads((output_dir / "evaluation" / "eval_info.json").read_text())["overall"]
     logger.info("ACT succeeds in %.0f %% of %d episodes", overall["pc_success"], overall["n_episodes"])
@@ -53,7 +51,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--demonstrations", type=int, default=20)
     parser.add_argument("--steps", type=int, default=100)
-    parser.add_argument("--episodes", type=int, default=5, help="of the evaluation")
+    parser.add_argument("--episodes", type=int, default=5, help="episodes of the evaluation")
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/examples/act"))
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)

@@ -1,8 +1,8 @@
-"""Behaviour cloning by LeRobot's own training loop, in this process, and the policy's success in unseen scenes.
+"""Behaviour cloning with LeRobot's own training loop, in this process, and the success rate on unseen scenes.
 
     python examples/train_and_evaluate.py --steps=1000
 
-Without --dataset, demonstrations are recorded and seen from above first. It takes some minutes on two cores.
+Without --dataset, demonstrations are recorded and views added first. The run takes some minutes on two cores.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from lerobot.scripts.lerobot_train import train
 from lerobot_policy_symview import SymviewBcConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, simulator_config
-from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import EnvSettings, NewDataset
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 def demonstrate(folder: Path) -> Path:
-    """Record demonstrations, make the view that the policy sees, and return the folder of that."""
+    """Record demonstrations, add the policy's view, and return the folder of the result."""
     recorded = generate(GenerateConfig(NewDataset("me/picking", folder / "picking"), num_episodes=20, resume=True))
     source = HubDataset("me/picking", recorded)
     return add_views(AddViewsConfig(source, new_root=folder / "views", size=76, keep=[], resume=True))
@@ -43,15 +43,15 @@ def main(dataset: Path | None, steps: int, episodes: int, output_dir: Path) -> N
     actor = Actor(SymviewBcPolicy.from_pretrained(checkpoint))
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + episodes)
     with Simulators(simulator_config(actor.policy.config, EnvSettings("block_picking")), count=2) as simulators:
-        found = evaluate(actor, simulators, seeds, discount=0.99)
-    logger.info("%d of %d episodes succeed, by the policy in %s", sum(found.success), episodes, checkpoint)
+        evaluation = evaluate(actor, simulators, seeds, discount=0.99)
+    logger.info("%d of %d episodes succeed with the policy in %s", sum(evaluation.success), episodes, checkpoint)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dataset", type=Path, help="folder of a dataset of block_picking with the view `reproj`")
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--episodes", type=int, default=20, help="of the evaluation")
+    parser.add_argument("--episodes", type=int, default=20, help="episodes of the evaluation")
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/examples/cloning"))
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)
