@@ -2,10 +2,10 @@
 
     python tools/orbit.py --output=docs/images/orbit.gif
 
-Left, the image of the side camera, with the border of the workspace drawn in; right, the view that `reproj` makes from
-that image, its depth, the camera's calibration and the gripper's state. The scene is simulated once: the scripted expert
-of block picking reaches for the red block, among four coloured bricks. Only the camera moves. The result depends on the
-options alone.
+Left: the side camera's image, with the border of the workspace drawn on the table. Right: the view that `reproj`
+computes from that image, its depth, the camera's calibration and the gripper's state. The scene is simulated once: the
+scripted expert of block picking reaches for the red block, beside three coloured bricks. Only the camera moves. The
+result depends on the options alone.
 """
 
 from __future__ import annotations

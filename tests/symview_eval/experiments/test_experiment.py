@@ -206,8 +206,8 @@ def test_numbers_in_the_documentation_come_from_the_committed_results(page, leas
     text = re.sub(r"\s+", " ", Path(page).read_text())
     printed = re.findall(r"\d+(?: \(\d+\))?, mean \d+", text)
     known = set()
-    for experiment in EXPERIMENTS.values():
-        for entry in entries(experiment, "laptop", Path("results")):
+    for table in EXPERIMENTS.values():
+        for entry in entries(table, "laptop", Path("results")):
             paper = "" if math.isnan(entry.paper) else f" ({percent(entry.paper)})"
             known.add(f"{percent(entry.best.mean)}{paper}, mean {percent(entry.last_five.mean)}")
     assert len(printed) >= least
