@@ -1,11 +1,12 @@
-"""Render the README's animation: a camera circles the table, and the top-down view stays the same.
+"""Render the README's animation: a camera swings around the table, and the top-down view stays the same.
 
     python tools/orbit.py --output=docs/images/orbit.gif
 
 Left: the side camera's image, with the border of the workspace drawn on the table. Right: the view that `reproj`
 computes from that image, its depth, the camera's calibration and the gripper's state. The scene is simulated once: the
-scripted expert of block picking reaches for the red block, beside three coloured bricks. Only the camera moves. The
-result depends on the options alone.
+scripted expert of block picking reaches for the red block, beside three coloured bricks. Only the camera moves. It
+swings 160 degrees and back. From the rest of the circle the arm hides bricks, and infill would replace them by their
+neighbours. The result depends on the options alone.
 """
 
 from __future__ import annotations
@@ -26,18 +27,19 @@ from lerobot_symview.views import Frame, ReprojectedView
 from symview_sim.env import SymviewEnv
 from symview_sim.rendering import render
 
-TASK, SEED, ACTIONS = "block_picking", 14, 1  # the red block lies beside the arm, where the camera always sees it
+TASK, SEED, ACTIONS = "block_picking", 14, 1
 CAMERA = CameraSpec(fov_deg=27.0, elevation_deg=50.0, distance=1.5)
+SWING = (-145.0, 15.0)  # degrees of azimuth, between which the arm hides little of the workspace
 BRICKS = (  # size (m), colour, centre relative to the workspace's (m), yaw (rad)
     ((0.09, 0.045, 0.022), (0.10, 0.35, 0.85), (-0.07, -0.13), 0.5),
     ((0.06, 0.06, 0.022), (0.98, 0.75, 0.10), (0.09, -0.12), 0.2),
-    ((0.09, 0.03, 0.022), (0.10, 0.62, 0.35), (-0.12, 0.09), -0.9),
+    ((0.09, 0.03, 0.022), (0.10, 0.62, 0.35), (-0.12, 0.13), -0.9),
 )
 OVERSAMPLING = 3  # camera pixels per pixel of the animation: PyBullet's software renderer does not smooth edges
 BORDER, BORDER_POINTS, BORDER_TOLERANCE = (0, 128, 128), 400, 0.01  # colour; points per side; metres
 MARGIN, LABEL_HEIGHT = 8, 26  # pixels
 LABELS = ("side camera (RGBD)", "top-down view made from that image")
-PALETTE = 96  # colours
+PALETTE = 80  # colours
 
 
 def make_scene(env: SymviewEnv) -> NDArray[np.float32]:
@@ -50,6 +52,13 @@ def make_scene(env: SymviewEnv) -> NDArray[np.float32]:
         observation, *_ = env.step(env.expert_action())
     state: NDArray[np.float32] = observation["agent_pos"]
     return state
+
+
+def swing(frames: int) -> list[float]:
+    """Return the azimuths of `frames` frames, degrees: from one end to the other and back, slower at the ends."""
+    first, last = SWING
+    phases = [min(index, frames - index) / frames for index in range(frames)]  # the way back repeats the way there
+    return [first + (last - first) * (1 - np.cos(2 * np.pi * phase)) / 2 for phase in phases]
 
 
 def camera_at(azimuth_deg: float, pixels: int, workspace: Workspace) -> Camera:
@@ -118,15 +127,15 @@ def save_gif(frames: list[Image.Image], path: Path, frames_per_second: float) ->
 
 
 def main(output: Path, frames: int, size: int, frames_per_second: float) -> None:
-    """Simulate the scene once, render it from `frames` azimuths of a full circle, and write the animation."""
+    """Simulate the scene once, render it from every azimuth of the swing and back, and write the animation."""
     env: SymviewEnv = gymnasium.make(symview_sim.gym_id(TASK)).unwrapped  # type: ignore[assignment]
+    azimuths = swing(frames)
     try:
         gripper = make_scene(env)
-        azimuths = np.arange(frames) * 360.0 / frames
-        pairs = [render_pair(env, gripper, azimuth, size) for azimuth in azimuths]
+        images = {azimuth: compose(*render_pair(env, gripper, azimuth, size)) for azimuth in set(azimuths)}
     finally:
         env.close()
-    save_gif([compose(*pair) for pair in pairs], output, frames_per_second)
+    save_gif([images[azimuth] for azimuth in azimuths], output, frames_per_second)
 
 
 def _resized(image: NDArray[np.uint8], size: int) -> Image.Image:
@@ -136,7 +145,7 @@ def _resized(image: NDArray[np.uint8], size: int) -> Image.Image:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("docs/images/orbit.gif"))
-    parser.add_argument("--frames", type=int, default=48, help="in one circle")
+    parser.add_argument("--frames", type=int, default=42, help="there and back")
     parser.add_argument("--size", type=int, default=336, help="rows and columns of either image, pixels")
     parser.add_argument("--frames_per_second", type=float, default=10)
     main(**vars(parser.parse_args()))
