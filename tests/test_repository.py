@@ -41,6 +41,14 @@ def test_the_readme_shows_the_commands_the_demo_runs():
         assert f"\n{command} " in readme
 
 
+def test_the_readme_is_short_and_its_files_exist():
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.splitlines()) <= 120
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", readme):
+        assert (ROOT / target).exists(), target
+    assert (ROOT / "docs" / "images" / "orbit.gif").stat().st_size < 10**6
+
+
 def test_public_names_are_there_and_simulators_start_without_numba():
     import lerobot_symview
 
