@@ -1,4 +1,4 @@
-"""Rewrites constraints.txt with the versions that a fresh resolution yields, every extra included, without addresses."""
+"""Rewrites constraints.txt with the versions of a fresh resolution of every extra, without addresses."""
 
 import subprocess
 from pathlib import Path

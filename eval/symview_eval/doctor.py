@@ -14,6 +14,7 @@ EXAMPLES = "  symview-doctor"
 
 REINSTALL = "run `make setup` in a clone, or reinstall as docs/install.md says"
 ESCNN = "1.0.11"  # the release that escnn_import.py patches
+ESCNN_NEEDS = "'scipy<1.20' joblib pymanopt autograd"  # its requirements, without those that planar groups do not use
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ def check_plugin() -> Finding:
     names = {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}
     if "lerobot_policy_symview" not in names:
         return Finding(
-            "plugin not installed under a name that LeRobot recognises", "pip install lerobot_policy_symview, or `make setup` in a clone"
+            "plugin not installed under a name that LeRobot recognises",
+            "pip install lerobot_policy_symview, or `make setup` in a clone",
         )
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
@@ -87,7 +89,8 @@ def check_torch() -> Finding:
 def check_escnn() -> Finding:
     """Only the benchmark `policy` and the conversion of escnn's weights need escnn."""
     if not _is_installed("escnn"):
-        return Finding("escnn is not installed (optional)", advice=f"pip install --no-deps escnn=={ESCNN}; see docs/install.md")
+        advice = f"pip install --no-deps escnn=={ESCNN} && pip install {ESCNN_NEEDS}"
+        return Finding("escnn is not installed (optional, for a benchmark)", advice=advice)
     from lerobot_policy_symview.nn.escnn_import import gspaces
 
     space = gspaces.flipRot2dOnR2(4)
