@@ -25,14 +25,15 @@ setup: $(READY) ## the environment alone, in .venv
 doctor: $(READY) ## what is wrong with the environment, and the remedy
 	@.venv/bin/symview-doctor
 
-$(READY): pyproject.toml tools/uv.sh
+$(READY): pyproject.toml constraints.txt tools/uv.sh
 	@echo "Setting up .venv: Python $$(cat .python-version), LeRobot, PyTorch (about 3 GB) and PyBullet."
 	@echo "PyBullet has no wheel for this Python and is compiled once: 3 to 10 minutes. Later runs start in seconds."
-	@UV_VERSION=$(UV_VERSION) tools/uv.sh sync --all-extras
+	@UV_VERSION=$(UV_VERSION) tools/uv.sh venv --quiet --allow-existing .venv
+	@UV_VERSION=$(UV_VERSION) tools/uv.sh pip install --python .venv --constraint constraints.txt --all-extras --requirement pyproject.toml --editable .
 	@touch $(READY)
 
-pins: ## write the versions installed now into pyproject.toml
-	@$(PYTHON) tools/pins.py
+pins: ## resolve every requirement anew and write the versions into constraints.txt
+	@UV_VERSION=$(UV_VERSION) $(PYTHON) tools/pins.py
 
 clean: ## remove what the demo made
 	rm -rf outputs/demo

@@ -63,7 +63,7 @@ def needed(provided: Sequence[str]) -> dict[str, Distribution]:
     PyTorch's small needs go along: another machine may have them in versions that are too old for the rest.
     """
     left_out = {_normal(name) for name in (*provided, *NEEDLESS)}
-    found = closure([f"{OURS}[sim]"])
+    found = closure([f"{OURS}[sim,escnn]"])
     return {name: one for name, one in found.items() if name not in left_out and not name.startswith(GPU_LIBRARIES)}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
-from symview_sim.bullet import pybullet
+from symview_sim.bullet import camera_image, pybullet
 
 NEAR, FAR = 0.05, 4.0  # metres, clipping planes
 SCENE, SCENE_RADIUS = np.array([0.45, 0.0, 0.0]), 1.5  # metres: objects and arm lie within
@@ -48,7 +48,8 @@ def render(client: Any, camera: Camera, labelled: bool = False) -> Picture:
     distance = float(np.linalg.norm(camera.position - SCENE))
     if distance + SCENE_RADIUS > FAR:  # a distant camera spends its depth range on the scene
         near, far = distance - SCENE_RADIUS, distance + SCENE_RADIUS
-    _, _, rgba, zbuffer, mask = client.getCameraImage(
+    rgba, zbuffer, mask = camera_image(
+        client,
         camera.width,
         camera.height,
         _column_major(invert_rigid(camera.world_from_cam @ np.diag([1.0, -1.0, -1.0, 1.0]))),
@@ -59,19 +60,19 @@ def render(client: Any, camera: Camera, labelled: bool = False) -> Picture:
     )
     table_rgb, table_depth = _table(camera)
     rgb, depth = table_rgb.copy(), table_depth.copy()
-    buffer = np.asarray(zbuffer).ravel()
+    buffer = zbuffer.ravel()
     drawn = np.flatnonzero(buffer < 1)  # few pixels: the rest is not touched
     drawn_depth = far * near / (far - (far - near) * buffer[drawn].astype(np.float64))
     behind = depth.ravel()[drawn]
     nearer = (drawn_depth < behind) | (behind == 0)
     drawn, drawn_depth = drawn[nearer], drawn_depth[nearer]
-    rgb.reshape(-1, 3)[drawn] = np.reshape(rgba, (-1, 4))[drawn, :3]
+    rgb.reshape(-1, 3)[drawn] = rgba.reshape(-1, 4)[drawn, :3]
     depth.ravel()[drawn] = drawn_depth
     if not labelled:
         return Picture(rgb, depth, None)
     labels = np.zeros(depth.shape, dtype=np.uint8)
     loaded = [client.getBodyUniqueId(index) for index in range(client.getNumBodies())]
-    labels.ravel()[drawn] = np.searchsorted(loaded, np.asarray(mask).ravel()[drawn])
+    labels.ravel()[drawn] = np.searchsorted(loaded, mask.ravel()[drawn])
     return Picture(rgb, depth, labels)
 
 

@@ -7,8 +7,9 @@ import json
 import platform
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import jinja2
@@ -29,7 +30,7 @@ IMAGES = {
     "side_persp": "perspective (RGB)",
     "top": "oracle (top-down camera)",
 }
-PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "escnn", "pybullet", "numpy")
+PACKAGES = ("lerobot_policy_symview", "lerobot", "torch", "pybullet", "numpy", "escnn")
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,19 @@ def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float
         chart=_loss_chart(read_losses(next((report.parent / "logs").glob("*-training.log")))),
         stages=[(stage, seconds[stage.name]) for stage in stages],
         total=sum(seconds.values()),
-        versions={name: version(name) for name in PACKAGES},
+        versions=installed_versions(),
         machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
     report.write_text(page)
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of those of `PACKAGES` that are installed."""
+    versions = {}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 def _loss_chart(points: Sequence[LossPoint]) -> str:

@@ -1,4 +1,4 @@
-"""`symview-doctor`: checks the environment for what people trip over and prints the remedy."""
+"""`symview-doctor`: checks the installation for known problems and prints the remedies."""
 
 from __future__ import annotations
 
@@ -12,26 +12,38 @@ from lerobot_symview.runtime.cli import CommandError, run_command
 
 EXAMPLES = "  symview-doctor"
 
-REINSTALL = "run `make setup`, or follow the README's section on pip"
+REINSTALL = "run `make setup` in a clone, or reinstall as docs/install.md says"
+ESCNN = "1.0.11"  # the release that escnn_import.py patches
+ESCNN_NEEDS = "'scipy<1.20' joblib pymanopt autograd"  # its requirements, without those that planar groups do not use
 
 
 @dataclass(frozen=True)
 class DoctorConfig:
-    """Check the environment and print a remedy for everything that is wrong with it."""
+    """Check the environment and print a remedy for everything that does not work, marked with `!!`.
+
+    `--` marks what is optional and absent, or works slowly; `ok` the rest.
+    """
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found; `remedy` is empty when all is well."""
+    """The result of a check.
+
+    Args:
+        text: one line.
+        remedy: how to repair what does not work; empty if all is well.
+        advice: how to install an optional package, or make one faster. Not an error.
+    """
 
     text: str
     remedy: str = ""
+    advice: str = ""
 
 
 def check_python() -> Finding:
-    """LeRobot 0.6 and escnn agree on Python 3.12."""
+    """LeRobot 0.6 needs Python 3.12 or newer."""
     version = sys.version.split()[0]
-    remedy = "" if sys.version_info[:2] == (3, 12) else "use Python 3.12"
+    remedy = "" if sys.version_info >= (3, 12) else "use Python 3.12"
     return Finding(f"Python {version}", remedy)
 
 
@@ -48,7 +60,8 @@ def check_plugin() -> Finding:
     names = {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}
     if "lerobot_policy_symview" not in names:
         return Finding(
-            "plugin not installed under a name that LeRobot recognises", "run `uv pip install -e .` in the repository"
+            "plugin not installed under a name that LeRobot recognises",
+            "pip install lerobot_policy_symview, or `make setup` in a clone",
         )
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
@@ -74,7 +87,10 @@ def check_torch() -> Finding:
 
 
 def check_escnn() -> Finding:
-    """The benchmark compares with escnn, which must do without the dependencies it cannot build here."""
+    """Only the benchmark `policy` and the conversion of escnn's weights need escnn."""
+    if not _is_installed("escnn"):
+        advice = f"pip install --no-deps escnn=={ESCNN} && pip install {ESCNN_NEEDS}"
+        return Finding("escnn is not installed (optional, for a benchmark)", advice=advice)
     from lerobot_policy_symview.nn.escnn_import import gspaces
 
     space = gspaces.flipRot2dOnR2(4)
@@ -100,16 +116,15 @@ def check_opencv() -> Finding:
 
 
 def check_pybullet() -> Finding:
-    """A pybullet that was compiled without numpy returns images as tuples."""
-    from symview_sim.bullet import pybullet
+    """The simulated tasks need pybullet; without numpy support it works, and renders more slowly."""
+    if not _is_installed("pybullet"):
+        advice = "pip install 'lerobot_policy_symview[sim]'"
+        return Finding("pybullet is not installed (optional, for the simulated tasks)", advice=advice)
+    from symview_sim.bullet import REBUILD, pybullet
 
     if pybullet.isNumpyEnabled():
         return Finding("pybullet with numpy support")
-    return Finding(
-        "pybullet compiled without numpy support",
-        "pip install 'numpy>=2,<2.3' setuptools && "
-        "pip install --force-reinstall --no-deps --no-build-isolation --no-cache-dir pybullet==3.2.7",
-    )
+    return Finding("pybullet was built without numpy support: rendering is slower", advice=REBUILD)
 
 
 def _is_installed(name: str) -> bool:
@@ -151,9 +166,11 @@ def doctor(config: DoctorConfig) -> None:
     """
     findings = diagnose()
     for finding in findings:
-        sys.stdout.write(f"{'!!' if finding.remedy else 'ok'}  {finding.text}\n")
+        sys.stdout.write(f"{'!!' if finding.remedy else '--' if finding.advice else 'ok'}  {finding.text}\n")
         if finding.remedy:
             sys.stdout.write(f"    remedy: {finding.remedy}\n")
+        elif finding.advice:
+            sys.stdout.write(f"    to change that: {finding.advice}\n")
     wrong = sum(bool(finding.remedy) for finding in findings)
     if wrong:
         raise CommandError(f"{wrong} of {len(findings)} checks failed")

@@ -28,6 +28,8 @@ def _stand_in_for_lie_learn() -> None:
     leaf.__dict__.update(wigner_d_matrix=unavailable, wigner_D_matrix=unavailable)
 
 
+if importlib.util.find_spec("escnn") is None:
+    raise ModuleNotFoundError("escnn is not installed; docs/install.md says how to install it", name="escnn")
 _stand_in_for_lie_learn()
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # py3nj is missing for the same reason, and as little used

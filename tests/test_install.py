@@ -1,0 +1,106 @@
+"""The wheel and the source archive hold what users need, and pip alone installs the wheel and runs it."""
+
+import os
+import subprocess
+import tarfile
+import tempfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = {
+    "lerobot_symview": "lerobot_symview",
+    "symview_sim": "datasets_gen/symview_sim",
+    "lerobot_policy_symview": "policies/lerobot_policy_symview",
+    "symview_eval": "eval/symview_eval",
+}
+OURS = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "PIP_CONSTRAINT", "UV_CONSTRAINT", "NUMBA_BOUNDSCHECK")
+
+
+def run(*command, fails=False):
+    """Run a command as a user does, outside this environment; return what it writes to stdout, or to stderr if it fails."""
+    clean = {name: value for name, value in os.environ.items() if name not in OURS}
+    words = [str(word) for word in command]
+    done = subprocess.run(words, capture_output=True, text=True, env=clean, cwd=ROOT, check=False)
+    assert (done.returncode != 0) == fails, (
+        f"{words} ended with {done.returncode}:\n{done.stdout}\n{done.stderr[-8000:]}"
+    )
+    return done.stderr if fails else done.stdout
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory):
+    """Build the source archive, and the wheel from it, as for a release."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(ROOT / "tools" / "uv.sh", "build", "--quiet", "--out-dir", folder)
+    return folder
+
+
+def files(package):
+    """Return every file of a package that git knows, by its place in the wheel."""
+    listed = subprocess.check_output(["git", "ls-files", "-z", PACKAGES[package]], cwd=ROOT, text=True)
+    return {f"{package}/{name.removeprefix(PACKAGES[package] + '/')}" for name in listed.split("\0") if name}
+
+
+def test_the_wheel_holds_every_file_of_every_package_and_nothing_else(archives):
+    (wheel,) = archives.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    expected = set().union(*(files(package) for package in PACKAGES))
+    assert {name for name in names if ".dist-info/" not in name} == expected
+    assert {"symview_eval/templates/demo.html", "symview_eval/experiments/paper/table1.csv"} <= names
+    assert {f"{package}/py.typed" for package in PACKAGES} <= names
+    assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
+
+
+def test_the_source_archive_holds_the_packages_and_no_tests(archives):
+    (archive,) = archives.glob("*.tar.gz")
+    with tarfile.open(archive) as stream:
+        names = {name.partition("/")[2] for name in stream.getnames()}
+    assert {"pyproject.toml", "constraints.txt", "LICENSE", "README.md"} <= names
+    for place in PACKAGES.values():
+        listed = subprocess.check_output(["git", "ls-files", "-z", place], cwd=ROOT, text=True)
+        assert {name for name in listed.split("\0") if name} <= names
+    assert not {name.split("/")[0] for name in names} & {".venv", ".tools", "tests", "results", "outputs", "data"}
+
+
+@pytest.fixture
+def programs():
+    """Make a fresh virtual environment and return the folder of its programs; 6 GB, so it is removed at once."""
+    with tempfile.TemporaryDirectory() as folder:
+        venv.create(folder, with_pip=True)
+        yield Path(folder) / "bin"
+
+
+@pytest.mark.install
+def test_pip_alone_installs_a_wheel_that_adds_views_and_trains(archives, programs, recorded, tmp_path):
+    """The versions are the registry's; PyBullet, whose compilation takes minutes, is left out."""
+    (wheel,) = archives.glob("*.whl")
+    run(programs / "python", "-m", "pip", "install", "--quiet", "--no-compile", wheel)
+    run(programs / "python", "-m", "pip", "check")
+    installed = (
+        "from importlib.util import find_spec; print([name for name in ('escnn', 'pybullet') if find_spec(name)])"
+    )
+    assert run(programs / "python", "-c", installed).strip() == "[]"
+
+    report = run(programs / "symview-doctor")
+    assert "!!" not in report
+    assert "--policy.type=symview_bc" in report
+    assert "lerobot_policy_symview[sim]" in report
+
+    views = tmp_path / "views"
+    new = ("--new_repo_id=test/installed", f"--new_root={views}", "--size=76", "--keep=[]")
+    run(programs / "symview-add-views", "--dataset.repo_id=test/recorded", f"--dataset.root={recorded}", *new)
+    policy = ("--policy.type=symview_bc", "--policy.width=16", "--policy.crop_size=64", "--policy.device=cpu")
+    steps = ("--steps=2", "--batch_size=2", "--num_workers=0", "--env_eval_freq=0", "--policy.push_to_hub=false")
+    data = ("--dataset.repo_id=test/installed", f"--dataset.root={views}", f"--output_dir={tmp_path / 'policy'}")
+    run(programs / "lerobot-train", *data, *policy, *steps)
+    assert (tmp_path / "policy" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+    remedy = "pip install 'lerobot_policy_symview[sim]'"
+    error = run(programs / "symview-generate", fails=True)
+    assert error == f"symview-generate: error: pybullet not installed: {remedy}\n"
