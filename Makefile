@@ -4,13 +4,16 @@ PYTHON := .venv/bin/python
 READY := .venv/.ready
 UV_VERSION := 0.13.9
 
-.PHONY: demo test lint docs setup doctor pins clean
+.PHONY: demo test test-fast lint docs setup doctor pins clean
 
 demo: $(READY) ## demonstrations, views, training, evaluation and a report in outputs/demo
 	@.venv/bin/symview-demo $(ARGS)
 
-test: $(READY) lint ## every test, slow ones included; `make test ARGS='-m "not slow"'` leaves those out
+test: $(READY) lint ## every test, slow ones included
 	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(ARGS)
+
+test-fast: $(READY) lint ## the tests that take seconds: under 4 minutes on 2 cores
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not slow and not long" $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

@@ -6,8 +6,8 @@ configurations and the processor steps; networks and the simulator are imported 
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from lerobot_policy_symview.encoders import register_encoder
 from lerobot_policy_symview.env_symview import SymviewEnvConfig
-from lerobot_policy_symview.nn.encoders.registry import register_encoder
 from lerobot_policy_symview.processor_allowlist import import_no_steps
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 

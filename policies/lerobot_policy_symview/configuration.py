@@ -9,8 +9,8 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, LRSchedulerConfig
 
+from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.methods import METHODS
-from lerobot_policy_symview.nn.encoders.registry import ENCODERS
 from lerobot_policy_symview.symmetry.groups import GROUP_NAMES, make_group
 from lerobot_policy_symview.symmetry.representations import ThetaRepresentation, VectorRepresentation
 from lerobot_symview import keys

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.encoders import make_encoder
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
-from lerobot_policy_symview.nn.encoders.registry import make_encoder
 from lerobot_policy_symview.processor_allowlist import check_processor_files
 from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_transform
 from lerobot_policy_symview.symmetry.groups import make_group

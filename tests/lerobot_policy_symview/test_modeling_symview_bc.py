@@ -7,10 +7,10 @@ from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_policy_symview.configuration import CHOICES, CROP_SIZES
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.equivariance import example_observation
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.nn.encoders.registry import ENCODERS
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
 from lerobot_symview.views import VIEWS, ReprojectedView

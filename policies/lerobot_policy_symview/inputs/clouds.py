@@ -10,6 +10,8 @@ from torch import Tensor
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.workspace import Workspace
 
+POINTS = 1024  # per scene, for the point-cloud encoder
+
 
 @dataclass(frozen=True)
 class Cloud:

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.inputs.clouds import cloud_from_depth
+from lerobot_policy_symview.inputs.clouds import POINTS, cloud_from_depth
 from lerobot_policy_symview.inputs.state import camera_directions
 from lerobot_policy_symview.inputs.voxels import voxelize
-from lerobot_policy_symview.nn.encoders.point_cloud import POINTS
 from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.encoders import make_encoder
 from lerobot_policy_symview.inputs.state import StateInput
-from lerobot_policy_symview.nn.encoders.registry import make_encoder
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, make_group
 
