@@ -88,6 +88,11 @@ class Registry[Value]:
         """Names of the built-in entries."""
         return tuple(self._builtin)
 
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """Names that were registered in this process."""
+        return tuple(self._registered)
+
     def check(self, name: str, kind: str | None = None) -> None:
         """Raise a ValueError, with the nearest known name, unless `name` is selectable; `kind` replaces the kind."""
         if name not in self:

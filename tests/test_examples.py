@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_symview import registry
-from lerobot_symview.views import VIEWS
 from symview_sim.settings import EnvSettings
+from tests.helpers.packages import temporary_registrations
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 
@@ -56,9 +55,9 @@ TRIALS = {
     "own_robot": Trial(
         "--width=16",
         (
-            "declared rightly: equivariant",
-            r"wrongly, turned by 90 degrees: \de-0[5-7]$",
-            r"wrongly, mirrored, turned by 0 degrees: \de[+-]0[01]$",
+            "correct declaration: equivariant",
+            r"wrong declaration, rotated by 90 degrees: \de-0[5-7]$",
+            r"wrong declaration, reflected, rotated by 0 degrees: \de[+-]0[01]$",
         ),
     ),
     "own_task": Trial("--episodes=3", ("3 demonstrations in 3 attempts",)),
@@ -97,7 +96,7 @@ TRIALS = {
         ("policy/checkpoints/last/pretrained_model/model.safetensors",),
     ),
     "view_of_one_image": Trial(
-        "--seed=3 --elevation_deg=50 --picture={output}/views.png",
+        "--seed=3 --elevation_deg=50 --output={output}/views.png",
         (r"the block is at x = 0\.\d+ m, y = -?0\.\d+ m",),
         ("views.png",),
     ),
@@ -114,10 +113,8 @@ def without_trace():
     """Forget the names that an example registers, and what it and LeRobot's training make of the root logger."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
-    yield
-    for name in set(VIEWS) - set(VIEWS.builtin) - set(registry.installed(VIEWS.group)):
-        VIEWS.unregister(name)
-    registry.installed.cache_clear()
+    with temporary_registrations():
+        yield
     root.handlers[:], root.level = handlers, level
 
 
@@ -170,5 +167,5 @@ def test_the_block_is_found_where_it_lies(run):
     env.reset(seed=5)
     lies = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
     env.close()
-    found = re.search(r"x = (\S+) m, y = (\S+) m", run("view_of_one_image", "--seed=5 --picture={output}/views.png"))
+    found = re.search(r"x = (\S+) m, y = (\S+) m", run("view_of_one_image", "--seed=5 --output={output}/views.png"))
     np.testing.assert_allclose([float(number) for number in found.groups()], lies, atol=0.005)

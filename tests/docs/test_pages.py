@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 from lerobot.datasets import LeRobotDataset, remove_feature
 
-from lerobot_symview import keys, registry
+from lerobot_symview import keys
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
+from tests.helpers.packages import temporary_registrations
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 from tests.malicious.files import change_feature
@@ -47,11 +48,10 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
     }
     for name in needs(page):
         datasets[name](reader.dataset(name.removeprefix("me/")))
-    with HubServer() as hub, online(hub, ALICE):
+    with HubServer() as hub, online(hub, ALICE), temporary_registrations():
         hub.users[ALICE] = (page.stem, {page.stem})
         yield page, reader
     shutil.rmtree(reader.dataset(""), ignore_errors=True)
-    registry.installed.cache_clear()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_symview import registry
+from lerobot_symview.views import VIEWS
+from symview_sim.tasks import TASKS
 
 
 @contextmanager
@@ -16,6 +19,20 @@ def registered(names: registry.Registry[Any], name: str, item: Any) -> Iterator[
         yield
     finally:
         names.unregister(name)
+
+
+@contextmanager
+def temporary_registrations() -> Iterator[None]:
+    """Forget what the block registers, and the entry points that it installs."""
+    registries = (ENCODERS, TASKS, VIEWS)
+    before = {names.kind: names.registered for names in registries}
+    try:
+        yield
+    finally:
+        for names in registries:
+            for name in set(names.registered) - set(before[names.kind]):
+                names.unregister(name)
+        registry.installed.cache_clear()
 
 
 def install(folder: Path, name: str, entry_points: dict[str, dict[str, str]], monkeypatch) -> None:
