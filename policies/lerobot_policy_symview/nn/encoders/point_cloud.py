@@ -99,7 +99,7 @@ class SetAbstraction(nn.Module):
         self.scales = nn.ModuleList(FieldMlp(group, inputs, fields) for _ in radii)
 
     def forward(self, position: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Map positions (B, P, 3) and features (B, P, channels) to those of the centres; scales' fields are joined."""
+        """Map positions (B, P, 3) and features (B, P, channels) to those of C centres, (B, C, ...)."""
         centers = _gather(position, farthest_points(position, self.centers))
         squared = _squared_distances(centers, position)
         nearest_first = squared.topk(self.neighbors, dim=-1, largest=False)
