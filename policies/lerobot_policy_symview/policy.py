@@ -143,7 +143,7 @@ class SymviewPolicy(PreTrainedPolicy):
         dataset_meta: Any = None,
     ) -> ModelCard:
         """Return the card that `lerobot-train` pushes with the policy."""
-        training = {} if cfg is None else {"steps": cfg.steps, "batches of": cfg.batch_size, "seed": cfg.seed}
+        training = {} if cfg is None else {"steps": cfg.steps, "batch size": cfg.batch_size, "seed": cfg.seed}
         if dataset_meta is not None:
             training = {"episodes": dataset_meta.total_episodes, "frames": dataset_meta.total_frames} | training
         card = model_card(self.config, self.parameter_count, dataset_repo_id, training, tags=tags or ())

@@ -161,7 +161,7 @@ def test_impossible_noise_is_refused(noise):
 
 
 def test_noise_on_an_aperture_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match="needs an entry `aperture` in --policy"):
+    with pytest.raises(ValueError, match="needs a dimension `aperture` in --policy"):
         make_config(aperture_noise=0.1, state_symmetry=["x", "y", "z"], gripper_input="vector")
 
 
@@ -216,15 +216,15 @@ def test_the_head_has_the_papers_parameter_count():
         ({"method": "reproj"}, "did you mean 'reproj_equi'"),
         ({"view": "reprojj"}, "did you mean 'reproj'"),
         ({"encoder": "transformer"}, "expected one of: equivariant"),
-        ({"view": "persp"}, "has no height; use --policy.modality=rgb"),
+        ({"view": "persp"}, "has no height map: use --policy.modality=rgb"),
         ({"width": 12}, "multiple of 16"),
         ({"crop_size": 100}, "expected one of: 64, 128"),
         ({"weight_averaging": 1.0}, "below 1"),
-        ({"augmentation": "group", "method": "sideview_nonequi"}, "group moves nothing with --policy.group=C1"),
-        ({"augmentation": "so2", "gripper_input": "none"}, "does not enter .*--policy.gripper_input=none"),
+        ({"augmentation": "group", "method": "sideview_nonequi"}, "group is the identity with --policy.group=C1"),
+        ({"augmentation": "so2", "gripper_input": "none"}, "is not an input .*--policy.gripper_input=none"),
         (
             {"augmentation": "d4", "gripper_input": "vector", "state_symmetry": ["x", "y"]},
-            r"does not enter .*--policy.state_symmetry=\['x', 'y'\].* use --policy.augmentation=none",
+            r"is not an input .*--policy.state_symmetry=\['x', 'y'\].* use --policy.augmentation=none",
         ),
         (
             {"normalization_mapping": {"ACTION": NormalizationMode.MEAN_STD}},

@@ -220,7 +220,7 @@ def test_simulators_are_refused_where_the_declared_state_is_not_theirs(observed)
     _, kinds = reordered(observed)
     assert simulator_config(make_config(), EnvSettings("block_picking")).names
     kinds.remove("scalar")
-    with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* it is x, y, z, yaw, aperture"):
+    with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* which is \[x, y, z, yaw, aperture\]"):
         simulator_config(make_config(state_symmetry=kinds), EnvSettings("block_picking"))
 
 

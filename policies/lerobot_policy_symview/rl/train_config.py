@@ -54,5 +54,5 @@ class TrainRlConfig:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if self.seed < 0:
             raise ValueError(f"--seed must not be negative, got {self.seed}")
-        if self.policy.view == "top" and not self.env.oracle:
+        if self.policy.view.name == "top" and not self.env.oracle:
             raise ValueError(f"--policy.method={self.policy.method} needs the camera 'top': use --env.oracle=true")

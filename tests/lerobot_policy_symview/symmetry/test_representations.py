@@ -59,7 +59,7 @@ def test_rotation_vectors_move_as_rotations_do():
 def test_representations_are_what_moving_does(symmetry, name):
     group = make_group(name)
     values = torch.rand(1, len(symmetry.dimensions), dtype=torch.float64)
-    for element, matrix in enumerate(symmetry.representation(group)):
+    for element, matrix in enumerate(symmetry.matrices(group)):
         moved = symmetry.transform(values, PlanarTransform.of_element(group, element, values), absolute_yaw=False)
         torch.testing.assert_close(moved[0], torch.tensor(matrix) @ values[0])
 
@@ -92,7 +92,7 @@ def test_a_wrong_declaration_is_refused_by_its_flag(kinds, message):
 
 
 def test_a_declaration_of_another_size_is_refused_with_the_features_names():
-    with pytest.raises(ValueError, match=r"describes 2 entries.*'action' has 3 \(dx, dy, dz\).*action_symmetry="):
+    with pytest.raises(ValueError, match=r"describes 2 dimensions.*'action' has 3 \(dx, dy, dz\).*action_symmetry="):
         VectorRepresentation(("x", "y"), "--policy.action_symmetry").check(3, "action", ["dx", "dy", "dz"])
 
 

@@ -91,7 +91,14 @@ def test_missing_inputs_are_named():
     with pytest.raises(ValueError, match="needs depth"):
         render_batch(make_view("reproj"), batch)
     with pytest.raises(ValueError, match="gripper"):
-        render_batch(make_view("persp"), batch)
+        render_batch(make_view("persp", plane_height="gripper"), batch)
+
+
+def test_without_the_grippers_state_no_gripper_is_drawn():
+    batch = colored_batch()
+    images = render_batch(make_view("persp"), batch)
+    assert list(images) == ["persp"]
+    assert torch.equal(images["persp"], render_batch(make_view("persp", gripper=False), batch)["persp"])
 
 
 @pytest.mark.parametrize(
