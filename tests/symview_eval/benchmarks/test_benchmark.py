@@ -119,6 +119,18 @@ def test_the_network_it_is_compared_with_computes_the_same():
     torch.testing.assert_close(plain(*seen), policy.network.encoder(*seen).flatten(1), rtol=1e-4, atol=1e-4)
 
 
+def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, caplog):
+    monkeypatch.setattr(policy_benchmark, "find_spec", lambda name: None)
+    monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
+    monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
+    config = policy_benchmark.PolicyBenchmark(batch_size=2, width=16, crop_size=64, repeats=1)
+    with caplog.at_level("INFO", logger=policy_benchmark.__name__):
+        results = policy_benchmark.benchmark_policy(config)
+    assert results["train_step_ratio_plain"] > 0
+    assert not [name for name in results if "escnn" in name]
+    assert "escnn is not installed" in caplog.text
+
+
 def test_policies_are_measured_in_bfloat16(monkeypatch):
     """escnn's network is left in float32; what does not depend on the precision is not measured here."""
     monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
