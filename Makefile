@@ -13,7 +13,7 @@ test: $(READY) lint ## every test, slow ones included
 	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(ARGS)
 
 test-fast: $(READY) lint ## the tests that take seconds: under 4 minutes on 2 cores
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not slow and not long" $(ARGS)
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not slow and not long and not install" $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

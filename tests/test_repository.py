@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,39 @@ PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def test_versions_are_pinned_without_addresses():
-    pins = PYPROJECT["tool"]["uv"]["constraint-dependencies"]
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = [line for line in lines if not line.startswith("#")]
     assert len(pins) > 50
     for pin in pins:
         assert re.fullmatch(r"[A-Za-z0-9_.\-]+==[^ /]+( ; .+)?", pin), pin
+
+
+def test_what_is_installed_at_run_time_has_ranges_and_no_escnn():
+    requirements = PYPROJECT["project"]["dependencies"]
+    assert not [one for one in requirements if "==" in one or one.startswith("escnn")]
+    assert "constraint-dependencies" not in PYPROJECT["tool"]["uv"]
+
+
+def test_every_imported_package_is_required():
+    """Of the packages that an extra installs, `symview_eval.commands` knows which."""
+    modules = {"cv2": "opencv-python-headless", "PIL": "pillow", "yaml": "pyyaml", "pybullet_data": "pybullet",
+               "pybullet_utils": "pybullet", "rerun": "lerobot", "wandb": "lerobot"}  # fmt: skip
+    project = PYPROJECT["project"]
+    required = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    names = {re.match(r"[\w.-]+", one)[0].lower().replace("_", "-") for one in required}
+    ours = {"lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval"}
+    for package in PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
+        for path in (ROOT / package).rglob("*.py"):
+            for name in re.findall(r"^\s*(?:from|import) (\w+)(?:\.[\w.]+)?(?: import| as|$)", path.read_text(), re.M):
+                if name not in ours and name not in sys.stdlib_module_names:
+                    assert modules.get(name, name).replace("_", "-") in names, f"{path} imports {name}"
+
+
+def test_only_its_own_modules_import_escnn():
+    files = subprocess.check_output(
+        ["git", "grep", "-lE", r"^\s*(from|import) escnn", "--", "*.py"], cwd=ROOT, text=True
+    )
+    assert files.split() == ["policies/lerobot_policy_symview/nn/escnn_import.py"]
 
 
 def test_every_package_is_typed_and_documented():

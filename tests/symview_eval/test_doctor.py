@@ -9,7 +9,7 @@ from symview_eval import doctor
 def test_a_sound_environment_needs_no_remedy():
     findings = doctor.diagnose()
     assert len(findings) == len(doctor.CHECKS)
-    assert [finding for finding in findings if finding.remedy] == []
+    assert [finding for finding in findings if finding.remedy or finding.advice] == []
 
 
 def test_two_opencvs_are_found(monkeypatch):
@@ -17,11 +17,26 @@ def test_two_opencvs_are_found(monkeypatch):
     assert "pip uninstall opencv-python opencv-python-headless" in doctor.check_opencv().remedy
 
 
-def test_a_pybullet_without_numpy_is_found(monkeypatch):
+def test_a_pybullet_without_numpy_works_and_can_be_rebuilt(monkeypatch):
     from symview_sim import bullet
 
     monkeypatch.setattr(bullet.pybullet, "isNumpyEnabled", lambda: 0)
-    assert "--no-build-isolation" in doctor.check_pybullet().remedy
+    finding = doctor.check_pybullet()
+    assert finding.remedy == ""
+    assert "--no-build-isolation" in finding.advice
+
+
+@pytest.mark.parametrize("name", ["escnn", "pybullet"])
+def test_absent_optional_packages_are_no_failure(monkeypatch, capsys, name):
+    monkeypatch.setattr(doctor, "_is_installed", lambda package: package != name)
+    check = getattr(doctor, f"check_{name}")
+    finding = check()
+    assert finding.remedy == ""
+    assert f"{name} is not installed" in finding.text
+    assert "pip install" in finding.advice
+    monkeypatch.setattr(doctor, "diagnose", lambda: [finding])
+    doctor.doctor(doctor.DoctorConfig())
+    assert capsys.readouterr().out.startswith("--  ")
 
 
 def test_a_lerobot_of_another_release_is_found(monkeypatch):

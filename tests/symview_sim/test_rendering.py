@@ -1,9 +1,12 @@
+import os
+
 import numpy as np
 import pytest
 
 from lerobot_symview.geometry.camera import project, unproject
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.views import Frame, make_view
+from symview_sim import bullet
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
@@ -55,6 +58,48 @@ def test_above_the_horizon_depth_is_invalid(scene):
     _, depth, _ = render(scene.client, make_camera(10.0, 180.0))
     assert (depth[0] == 0).any()
     assert (depth[-1] > 0).all()
+
+
+class TupleClient:
+    """A client as PyBullet offers it without numpy support: images are flat tuples of Python numbers."""
+
+    def __init__(self, client):
+        self._client = client
+
+    def __getattr__(self, name):
+        return getattr(self._client, name)
+
+    def getCameraImage(self, *arguments, **options):  # noqa: N802
+        width, height, *images = self._client.getCameraImage(*arguments, **options)
+        return width, height, *(tuple(image.ravel().tolist()) for image in images)
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_a_pybullet_without_numpy_renders_bit_identical_images(scene, labelled):
+    camera = make_camera(45.0)
+    expected = render(scene.client, camera, labelled)
+    result = render(TupleClient(scene.client), camera, labelled)
+    for one, other in zip(result, expected, strict=True):
+        assert (one is None) == (other is None)
+        if other is not None:
+            assert (one.dtype, one.shape) == (other.dtype, other.shape)
+            assert one.tobytes() == other.tobytes()
+
+
+def test_a_pybullet_without_numpy_is_reported_once_with_the_remedy(monkeypatch, caplog):
+    monkeypatch.delenv(bullet.WARNED, raising=False)
+    bullet.warn_without_numpy()
+    assert not caplog.records  # this build has numpy support
+    monkeypatch.setattr(bullet.pybullet, "isNumpyEnabled", lambda: 0)
+    bullet.warn_without_numpy()
+    bullet.warn_without_numpy()
+    (record,) = caplog.records
+    assert bullet.REBUILD in record.getMessage()
+    assert os.environ[bullet.WARNED]  # processes that are started from here stay silent
+    monkeypatch.delenv(bullet.WARNED)
+    monkeypatch.setattr(bullet.multiprocessing, "parent_process", lambda: object())
+    bullet.warn_without_numpy()
+    assert len(caplog.records) == 1
 
 
 def test_hiding_the_arm_removes_it_and_brings_it_back(scene):

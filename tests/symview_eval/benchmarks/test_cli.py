@@ -119,8 +119,25 @@ def test_the_plain_network_computes_the_same_features():
     torch.testing.assert_close(plain(*inputs), policy.network.encoder(*inputs).flatten(1), rtol=1e-4, atol=1e-4)
 
 
+<<<<<<< HEAD:tests/symview_eval/benchmarks/test_cli.py
 def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
     """escnn's network stays in float32. Parts that do not depend on the precision are replaced."""
+=======
+def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, caplog):
+    monkeypatch.setattr(policy_benchmark, "find_spec", lambda name: None)
+    monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
+    monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
+    config = policy_benchmark.PolicyBenchmark(batch_size=2, width=16, crop_size=64, repeats=1)
+    with caplog.at_level("INFO", logger=policy_benchmark.__name__):
+        results = policy_benchmark.benchmark_policy(config)
+    assert results["train_step_ratio_plain"] > 0
+    assert not [name for name in results if "escnn" in name]
+    assert "escnn is not installed" in caplog.text
+
+
+def test_policies_are_measured_in_bfloat16(monkeypatch):
+    """escnn's network is left in float32; what does not depend on the precision is not measured here."""
+>>>>>>> install:tests/symview_eval/benchmarks/test_benchmark.py
     monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
     monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
