@@ -119,10 +119,6 @@ def test_the_plain_network_computes_the_same_features():
     torch.testing.assert_close(plain(*inputs), policy.network.encoder(*inputs).flatten(1), rtol=1e-4, atol=1e-4)
 
 
-<<<<<<< HEAD:tests/symview_eval/benchmarks/test_cli.py
-def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
-    """escnn's network stays in float32. Parts that do not depend on the precision are replaced."""
-=======
 def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, caplog):
     monkeypatch.setattr(policy_benchmark, "find_spec", lambda name: None)
     monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
@@ -135,9 +131,8 @@ def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, ca
     assert "escnn is not installed" in caplog.text
 
 
-def test_policies_are_measured_in_bfloat16(monkeypatch):
-    """escnn's network is left in float32; what does not depend on the precision is not measured here."""
->>>>>>> install:tests/symview_eval/benchmarks/test_benchmark.py
+def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
+    """escnn's network stays in float32. Parts that do not depend on the precision are replaced."""
     monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
     monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
