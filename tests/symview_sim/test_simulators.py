@@ -8,11 +8,12 @@ import pytest
 
 from lerobot_symview import keys
 from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.views import ViewSpec
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observed, Reset, Simulators, Step
 
 NAMES = (keys.view("side", "reproj"), keys.view("side", "reproj_height"), keys.STATE)
-OBSERVED = Observed(EnvSettings(max_steps=3), NAMES, {"reproj": {"size": 76}})
+OBSERVED = Observed(EnvSettings(max_steps=3), NAMES, (ViewSpec("reproj", {"size": 76}),))
 ACTIONS = np.random.default_rng(0).uniform(-0.05, 0.05, (20, 5)).astype(np.float32)
 
 

@@ -132,7 +132,7 @@ def test_an_update_matches_the_equations():
     learner = Learner(make_actor(method="sideview_nonequi", augmentation="none", bc_weight=0.5))
     sample = make_sample(learner)
     frames = learner.codec.unpack(sample.frames, torch.device("cpu"))
-    inputs = learner.policy.network_input(frames, place=torch.full((2 * BATCH, 2), 0.5))
+    inputs = learner.policy.network_input(frames, crop_offset=torch.full((2 * BATCH, 2), 0.5))
     (observation, next_observation), (state, next_state) = (part.chunk(2) for part in inputs)
 
     def q(critic, observation, state, action):

@@ -104,8 +104,8 @@ def test_scaling_commutes_with_quarter_turns_and_mirror_images(size):
 
 
 def test_parts_begin_where_they_are_placed():
-    place = torch.tensor([[0.0, 0.0], [0.999, 0.5]])  # 8 possible rows and columns
-    parts = crop(IMAGES, 5, place)
+    offset = torch.tensor([[0.0, 0.0], [0.999, 0.5]])  # 8 possible rows and columns
+    parts = crop(IMAGES, 5, offset)
     torch.testing.assert_close(parts[0], IMAGES[0, :, :5, :5])
     torch.testing.assert_close(parts[1], IMAGES[1, :, 7:, 4:9])
 
