@@ -56,8 +56,8 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def __init__(self, settings: EnvSettings, render_mode: str | None = "rgb_array"):
         self.settings = settings
         self.task, self.workspace = settings.task, settings.workspace
-        self._task = make_task(settings.task)
-        self.task_description = self._task.instruction
+        self.episode_task = make_task(settings.task)
+        self.task_description = self.episode_task.instruction
         self.render_mode = render_mode
         self._max_episode_steps = settings.max_steps  # LeRobot reads it under this name
         self._robot = lookup("robot", settings.robot, ROBOTS)
@@ -87,7 +87,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         jitter = self.np_random.uniform(-largest, largest, size=3)
         start = np.array([*self.workspace.center, START_HEIGHT]) + jitter
         self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
-        self._task.spawn(self.scene, self.np_random)
+        self.episode_task.spawn(self.scene, self.np_random)
         self.scene.settle()
         pose_rng, self._sensor_rng = self.np_random.spawn(2)  # cameras do not change the physics
         self.cameras |= {spec.name: spec.place(self.workspace, pose_rng) for spec in self.specs if spec.varies}
@@ -99,14 +99,14 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
         arm.move(np.clip(arm.position + motion[:3], *self._reach), arm.yaw + motion[3], aperture)
         self._steps += 1
-        success = bool(self._task.is_success(self.scene))
-        terminated = success or not self._task.is_valid(self.scene)
+        success = bool(self.episode_task.is_success(self.scene))
+        terminated = success or not self.episode_task.is_valid(self.scene)
         truncated = self._steps >= self._max_episode_steps and not terminated
         return self._observe(), float(success), terminated, truncated, {"is_success": success}
 
     def expert_action(self) -> NDArray[np.float32]:
         """Return the expert's action in the current state, (5,) float32."""
-        return self._task.expert_action(self.scene).astype(np.float32)
+        return self.episode_task.expert_action(self.scene).astype(np.float32)
 
     def render(self) -> NDArray[np.uint8]:
         """Return the first camera's image, (256, W, 3) uint8."""

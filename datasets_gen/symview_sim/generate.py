@@ -97,11 +97,11 @@ def generate(config: GenerateConfig) -> Path:
 
 def _write(config: GenerateConfig) -> Path:
     target = config.dataset.folder()
-    recording = _plan(config, target)
+    recording = plan_recording(config, target)
     if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):
         logger.info("%s is already complete", target)
         return target
-    _begin(recording, config.resume)
+    begin_recording(recording, config.resume)
     attempts = recorded_attempts(recording)
     missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
     with EXECUTORS[config.executor](config.num_workers, "symview_sim.recording") as executor:
@@ -122,7 +122,12 @@ def _write(config: GenerateConfig) -> Path:
     return target
 
 
-def _plan(config: GenerateConfig, target: Path) -> Recording:
+def plan_recording(config: GenerateConfig, target: Path) -> Recording:
+    """Return what is recorded and where; this makes the environment once.
+
+    Raises:
+        ValueError: if a camera sees farther than the depth of a video reaches.
+    """
     env = config.env.make()
     if config.video:
         _check_video_depth(env, config.env.oracle)
@@ -142,7 +147,8 @@ def _plan(config: GenerateConfig, target: Path) -> Recording:
     return recording
 
 
-def _begin(recording: Recording, resume: bool) -> None:
+def begin_recording(recording: Recording, resume: bool) -> None:
+    """Create the folders of a recording, or check that those that exist belong to it."""
     open_partial(recording.folder, recording.description(), resume)
     for pieces in ("episodes", "shards"):
         (recording.folder / pieces).mkdir(exist_ok=True)

@@ -76,9 +76,19 @@ class EnvSettings:
         return (self.camera, *self.more_cameras, *oracle)
 
     def make(self) -> SymviewEnv:
-        """Return a new environment. PyBullet is imported only now."""
-        from symview_sim.env import SymviewEnv
+        """Return a new environment. PyBullet is imported only now.
 
+        Raises:
+            ModuleNotFoundError: if PyBullet is not installed; the message names the extra.
+        """
+        try:
+            from symview_sim.env import SymviewEnv
+        except ModuleNotFoundError as error:
+            if error.name != "pybullet":
+                raise
+            raise ModuleNotFoundError(
+                "the simulated tasks need PyBullet: pip install 'lerobot_policy_symview[sim]'", name=error.name
+            ) from None
         return SymviewEnv(self)
 
 

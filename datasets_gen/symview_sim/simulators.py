@@ -39,7 +39,7 @@ Observation = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Observed:
+class SimulatorConfig:
     """The environment to simulate and the features to report."""
 
     env: EnvSettings
@@ -92,12 +92,12 @@ class Simulators:
     """Several simulators that run in parallel: send a command to each, then receive each result.
 
     Args:
-        observed: environment and features of each simulator.
+        config: environment and features of each simulator.
         count: number of simulators.
     """
 
-    def __init__(self, observed: Observed, count: int):
-        self._observed = observed
+    def __init__(self, config: SimulatorConfig, count: int):
+        self._config = config
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload([__name__])
         self._spare_seeds = [0] * count
@@ -170,7 +170,7 @@ class Simulators:
 
     def _start(self) -> tuple[Any, Connection]:
         ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_simulate, args=(theirs, self._observed), daemon=True)
+        process = self._context.Process(target=_simulate, args=(theirs, self._config), daemon=True)
         with _unseen_main():
             process.start()
         theirs.close()
@@ -185,15 +185,15 @@ def _unseen_main() -> Iterator[None]:
         yield
 
 
-def _simulate(connection: Connection, observed: Observed) -> None:
+def _simulate(connection: Connection, config: SimulatorConfig) -> None:
     """Execute commands until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C stops the training process, which stops this one
-    env = observed.env.make()
-    views = [spec.make() for spec in observed.views]
-    workspace = parse_workspace(observed.workspace)
+    env = config.env.make()
+    views = [spec.make() for spec in config.views]
+    workspace = parse_workspace(config.workspace)
 
     def report(raw: RawObservation) -> Observation:
-        return _observation(raw, observed, views, workspace)
+        return _observation(raw, config, views, workspace)
 
     while True:
         try:
@@ -222,9 +222,11 @@ def _carry_out(command: Reset | Step, env: SymviewEnv, report: Callable[[RawObse
     return Outcome(observation, last, reward, terminated, info["is_success"])
 
 
-def _observation(raw: RawObservation, observed: Observed, views: Sequence[View], workspace: Workspace) -> Observation:
+def _observation(
+    raw: RawObservation, config: SimulatorConfig, views: Sequence[View], workspace: Workspace
+) -> Observation:
     features = named_features(raw)
-    camera, depth = observed.camera, keys.depth(observed.camera)
+    camera, depth = config.camera, keys.depth(config.camera)
     for view in views:
         rgb = features[keys.rgb(camera)]
         frame = Frame(
@@ -236,4 +238,4 @@ def _observation(raw: RawObservation, observed: Observed, views: Sequence[View],
         )
         for output, image in view.render(frame).items():
             features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
-    return {name: features[name] for name in observed.names}
+    return {name: features[name] for name in config.names}

@@ -88,7 +88,7 @@ def check_torch() -> Finding:
 
 def check_escnn() -> Finding:
     """Only the benchmark `policy` and the conversion of escnn's weights need escnn."""
-    if not _is_installed("escnn"):
+    if not is_installed("escnn"):
         advice = f"pip install --no-deps escnn=={ESCNN} && pip install {ESCNN_NEEDS}"
         return Finding("escnn is not installed (optional, for a benchmark)", advice=advice)
     from lerobot_policy_symview.nn.escnn_import import gspaces
@@ -107,7 +107,7 @@ def check_opencv() -> Finding:
             "opencv-contrib-python",
             "opencv-contrib-python-headless",
         )
-        if _is_installed(name)
+        if is_installed(name)
     ]
     remedy = "" if len(installed) == 1 else f"pip uninstall {' '.join(installed)}; pip install opencv-python-headless"
     import cv2
@@ -117,7 +117,7 @@ def check_opencv() -> Finding:
 
 def check_pybullet() -> Finding:
     """The simulated tasks need pybullet; without numpy support it works, and renders more slowly."""
-    if not _is_installed("pybullet"):
+    if not is_installed("pybullet"):
         advice = "pip install 'lerobot_policy_symview[sim]'"
         return Finding("pybullet is not installed (optional, for the simulated tasks)", advice=advice)
     from symview_sim.bullet import REBUILD, pybullet
@@ -127,7 +127,8 @@ def check_pybullet() -> Finding:
     return Finding("pybullet was built without numpy support: rendering is slower", advice=REBUILD)
 
 
-def _is_installed(name: str) -> bool:
+def is_installed(name: str) -> bool:
+    """Whether a distribution is installed."""
     try:
         importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:

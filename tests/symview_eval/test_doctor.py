@@ -13,7 +13,7 @@ def test_a_sound_environment_needs_no_remedy():
 
 
 def test_two_opencvs_are_found(monkeypatch):
-    monkeypatch.setattr(doctor, "_is_installed", lambda name: name in ("opencv-python", "opencv-python-headless"))
+    monkeypatch.setattr(doctor, "is_installed", lambda name: name in ("opencv-python", "opencv-python-headless"))
     assert "pip uninstall opencv-python opencv-python-headless" in doctor.check_opencv().remedy
 
 
@@ -28,7 +28,7 @@ def test_a_pybullet_without_numpy_works_and_can_be_rebuilt(monkeypatch):
 
 @pytest.mark.parametrize("name", ["escnn", "pybullet"])
 def test_absent_optional_packages_are_no_failure(monkeypatch, capsys, name):
-    monkeypatch.setattr(doctor, "_is_installed", lambda package: package != name)
+    monkeypatch.setattr(doctor, "is_installed", lambda package: package != name)
     check = getattr(doctor, f"check_{name}")
     finding = check()
     assert finding.remedy == ""

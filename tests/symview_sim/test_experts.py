@@ -53,7 +53,10 @@ def test_experts_are_equivariant_to_rotations_and_reflections(task, reflect):
             for quarter_turns in range(4):
                 scene = TransformedScene(env.scene, quarter_turns, reflect)
                 np.testing.assert_allclose(
-                    env._task.expert_action(scene), scene.transformed_action(action), atol=1e-6, err_msg=f"seed {seed}"
+                    env.episode_task.expert_action(scene),
+                    scene.transformed_action(action),
+                    atol=1e-6,
+                    err_msg=f"seed {seed}",
                 )
                 compared += 1
             _, _, terminated, truncated, _ = env.step(action)

@@ -264,8 +264,8 @@ def _begun(folder, **options):
     """Begin a recording in `folder`, simulate two of its five episodes and return its description for workers."""
     from symview_sim import generate as module
 
-    plan = module._plan(config(folder / "data", **options), folder / "data")
-    module._begin(plan, resume=False)
+    plan = module.plan_recording(config(folder / "data", **options), folder / "data")
+    module.begin_recording(plan, resume=False)
     for episode in range(2):
         recording.record_episode(plan, episode)
     return plan

@@ -89,3 +89,17 @@ def test_importing_the_settings_imports_no_simulator_and_no_lerobot():
     heavy = ["pybullet", "numba", "lerobot", "cv2", "torch", "draccus"]
     code = f"import sys, symview_sim.settings; sys.exit(', '.join(set({heavy}) & set(sys.modules)) or None)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_without_pybullet_the_extra_is_named(monkeypatch):
+    for module in (
+        "symview_sim.env",
+        "symview_sim.scene",
+        "symview_sim.arm",
+        "symview_sim.bullet",
+        "symview_sim.rendering",
+    ):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'lerobot_policy_symview\[sim\]'"):
+        EnvSettings().make()

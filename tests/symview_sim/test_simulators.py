@@ -10,16 +10,16 @@ from lerobot_symview import keys
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import ViewSpec
 from symview_sim.settings import EnvSettings
-from symview_sim.simulators import Observed, Reset, Simulators, Step
+from symview_sim.simulators import Reset, SimulatorConfig, Simulators, Step
 
 NAMES = (keys.view("side", "reproj"), keys.view("side", "reproj_height"), keys.STATE)
-OBSERVED = Observed(EnvSettings(max_steps=3), NAMES, (ViewSpec("reproj", {"size": 76}),))
+CONFIG = SimulatorConfig(EnvSettings(max_steps=3), NAMES, (ViewSpec("reproj", {"size": 76}),))
 ACTIONS = np.random.default_rng(0).uniform(-0.05, 0.05, (20, 5)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def simulators():
-    with Simulators(OBSERVED, 2) as two:
+    with Simulators(CONFIG, 2) as two:
         yield two
 
 
@@ -41,7 +41,7 @@ def test_observations_equal_those_of_the_environment_and_the_view(simulators):
     from symview_sim.env import named_features
 
     outcome = run(simulators, 0, Reset(7))
-    env = OBSERVED.env.make()
+    env = CONFIG.env.make()
     raw = named_features(env.reset(seed=7)[0])
     env.close()
     camera = stored_camera(raw[keys.intrinsics("side")], raw[keys.world_from_cam("side")], 152, 152)
@@ -100,7 +100,7 @@ def test_a_dead_simulator_is_replaced_and_its_episode_lost(simulators, caplog, w
 
 
 def test_a_simulator_that_dies_at_every_start_raises_an_error():
-    broken = Observed(EnvSettings(), ("observation.images.nowhere",))
+    broken = SimulatorConfig(EnvSettings(), ("observation.images.nowhere",))
     with Simulators(broken, 1) as one:
         one.send(0, Reset(0))
         with pytest.raises(CommandError, match="simulator 0 dies as soon as it is started"):
@@ -114,7 +114,7 @@ def test_ctrl_c_does_not_stop_a_simulator(simulators):
 
 
 def test_closed_simulators_leave_no_process():
-    with Simulators(OBSERVED, 1) as one:
+    with Simulators(CONFIG, 1) as one:
         run(one, 0, Reset(0))
         (process,) = one.process_ids
     with pytest.raises(ProcessLookupError):

@@ -115,7 +115,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
         time of a training step. Without the extra `escnn`, the entries of escnn are left out.
     """
     start = time.perf_counter()
-    policy = _policy(config)
+    policy = make_policy(config)
     construct = time.perf_counter() - start
     encoder = policy.network.encoder
     assert isinstance(encoder, ImageEncoder)
@@ -126,7 +126,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     else:
         networks["escnn_"] = (_escnn(encoder).to(config.device), "float32")
     networks |= {f"plain_{dtype}_": (plain, dtype) for dtype in _precisions(config.device)}
-    image, state = _input(config, policy, config.batch_size)
+    image, state = example_input(config, policy, config.batch_size)
     calls = {name: _training_step(network, image, state, dtype) for name, (network, dtype) in networks.items()}
     steps = _medians(calls, config.repeats, "step")
     results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
@@ -140,23 +140,24 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     if "plain_bfloat16_" in networks:  # converted once, not at every call
         networks["plain_bfloat16_"] = (deepcopy(plain).to(torch.bfloat16), "bfloat16")
     for batch in (1, 5):
-        inputs = _input(config, policy, batch)
+        inputs = example_input(config, policy, batch)
         calls = {name: _inference(network.eval(), *inputs, dtype) for name, (network, dtype) in networks.items()}
         times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
         results |= {
             f"inference_ms_b{batch}": 1000 * times[""],
             f"inference_ratio_b{batch}": times[""] / _plain(times),
         }
-    loading = _loading_seconds(config)
+    loading = loading_seconds(config)
     return results | {
-        "plugin_import_s": _plugin_import(),
+        "plugin_import_s": plugin_import_seconds(),
         "construct_s": construct,
         "loader_s": loading,
         "loader_share": loading / steps[""],
     }
 
 
-def _policy(config: PolicyBenchmark) -> SymviewBcPolicy:
+def make_policy(config: PolicyBenchmark) -> SymviewBcPolicy:
+    """Return an untrained policy of the benchmark's size."""
     settings = SymviewBcConfig(device=config.device, width=config.width, crop_size=config.crop_size)
     settings.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),))}
     return SymviewBcPolicy(settings).to(config.device)
@@ -172,7 +173,8 @@ def _escnn(encoder: ImageEncoder) -> nn.Module:
     return network
 
 
-def _input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
+def example_input(config: PolicyBenchmark, policy: SymviewBcPolicy, batch: int) -> tuple[Tensor, Tensor]:
+    """Return random images (B, C, crop, crop) and states (B, 2), the same at every call."""
     generator = torch.Generator().manual_seed(0)
     size = config.crop_size
     image = torch.rand(batch, policy.config.channels, size, size, generator=generator)
@@ -251,13 +253,14 @@ def _operations_per_second(config: PolicyBenchmark, size: int = 1024, repeats: i
     return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
 
 
-def _plugin_import() -> float:
+def plugin_import_seconds() -> float:
+    """Return the time that the plugin adds to LeRobot's import, in a process of its own."""
     command = [sys.executable, "-c", PLUGIN]
     done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603  a constant of this module
     return float(done.stdout.split()[-1])
 
 
-def _loading_seconds(config: PolicyBenchmark) -> float:
+def loading_seconds(config: PolicyBenchmark) -> float:
     """Return the seconds that LeRobot's loader takes per batch in the training process, for a dataset of views only."""
     from lerobot.datasets import LeRobotDataset
 

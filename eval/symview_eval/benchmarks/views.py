@@ -85,7 +85,7 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        results = _ratios(_frame(), config.repeats)
+        results = _ratios(simulated_frame(), config.repeats)
     finally:
         cv2.setNumThreads(threads)
     results |= _on_a_gpu(config.repeats)
@@ -95,7 +95,7 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
 def _on_a_gpu(repeats: int) -> dict[str, float]:
     import torch  # imported here: worker processes import this module, and torch takes longer than their work
 
-    return batched_ratios(_frame(), repeats, "cuda") if torch.cuda.is_available() else {}
+    return batched_ratios(simulated_frame(), repeats, "cuda") if torch.cuda.is_available() else {}
 
 
 def batched_ratios(frame: Frame, repeats: int, device: str) -> dict[str, float]:
@@ -143,7 +143,8 @@ def _bytes_moved(frame: Frame) -> int:
     return frame.rgb.nbytes + frame.depth.nbytes + make_view("reproj").size ** 2 * 7  # colour and float height
 
 
-def _frame() -> Frame:
+def simulated_frame() -> Frame:
+    """Return the first frame of an episode of block picking."""
     env = EnvSettings().make()
     observation, _ = env.reset(seed=0)
     camera = env.cameras["side"]

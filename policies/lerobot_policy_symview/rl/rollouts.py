@@ -21,7 +21,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.units import Unit
 from symview_sim.settings import EnvSettings
-from symview_sim.simulators import Observation, Observed, Reset, Simulators, Step
+from symview_sim.simulators import Observation, Reset, SimulatorConfig, Simulators, Step
 
 EVALUATION_SEED = 1000  # first seed of lerobot-eval, so that both evaluate on the same scenes
 
@@ -71,7 +71,7 @@ def metric_depth(config: SymviewConfig) -> dict[str, Unit]:
     return {key: "m" for key in depth if key is not None}
 
 
-def simulator_config(config: SymviewConfig, env: EnvSettings) -> Observed:
+def simulator_config(config: SymviewConfig, env: EnvSettings) -> SimulatorConfig:
     """Return the configuration of simulators of `env` whose observations have the features that a policy needs.
 
     Raises:
@@ -86,7 +86,7 @@ def simulator_config(config: SymviewConfig, env: EnvSettings) -> Observed:
             f"--policy.state_symmetry={config.state_symmetry} does not fit the simulators' state, which is "
             f"[{', '.join(keys.STATE_NAMES)}]"
         )
-    return Observed(
+    return SimulatorConfig(
         env=env,
         names=tuple(make_scene_input(config, parse_workspace(config.workspace)).keys),
         views=tuple(config.views_to_make),

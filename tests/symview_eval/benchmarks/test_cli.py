@@ -113,16 +113,16 @@ def test_the_rl_benchmark_names_every_time(monkeypatch, capsys):
 
 def test_the_plain_network_computes_the_same_features():
     config = policy_benchmark.PolicyBenchmark(width=16, crop_size=64)
-    policy = policy_benchmark._policy(config)
-    inputs = policy_benchmark._input(config, policy, 3)
+    policy = policy_benchmark.make_policy(config)
+    inputs = policy_benchmark.example_input(config, policy, 3)
     plain = policy_benchmark.PlainNetwork(policy.network.encoder)
     torch.testing.assert_close(plain(*inputs), policy.network.encoder(*inputs).flatten(1), rtol=1e-4, atol=1e-4)
 
 
 def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, caplog):
     monkeypatch.setattr(policy_benchmark, "find_spec", lambda name: None)
-    monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
-    monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
+    monkeypatch.setattr(policy_benchmark, "loading_seconds", lambda config: 1.0)
+    monkeypatch.setattr(policy_benchmark, "plugin_import_seconds", lambda: 1.0)
     config = policy_benchmark.PolicyBenchmark(batch_size=2, width=16, crop_size=64, repeats=1)
     with caplog.at_level("INFO", logger=policy_benchmark.__name__):
         results = policy_benchmark.benchmark_policy(config)
@@ -133,8 +133,8 @@ def test_without_escnn_the_policy_benchmark_leaves_its_ratio_out(monkeypatch, ca
 
 def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
     """escnn's network stays in float32. Parts that do not depend on the precision are replaced."""
-    monkeypatch.setattr(policy_benchmark, "_loading_seconds", lambda config: 1.0)
-    monkeypatch.setattr(policy_benchmark, "_plugin_import", lambda: 1.0)
+    monkeypatch.setattr(policy_benchmark, "loading_seconds", lambda config: 1.0)
+    monkeypatch.setattr(policy_benchmark, "plugin_import_seconds", lambda: 1.0)
     monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
     computed = {}
     for kind in (policy_benchmark.PlainNetwork, ConvolutionalEncoder, EscnnEncoder):
@@ -162,6 +162,6 @@ def test_an_unavailable_precision_or_device_is_refused(option, value):
 
 
 def test_batched_ratios_on_the_cpu():
-    results = views_benchmark.batched_ratios(views_benchmark._frame(), 2, "cpu")
+    results = views_benchmark.batched_ratios(views_benchmark.simulated_frame(), 2, "cpu")
     assert len(results) == 6
     assert all(value > 0 for value in results.values())
