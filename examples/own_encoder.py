@@ -40,7 +40,7 @@ class TransformedScenes(Encoder):
         features = []
         for element in range(self.group.size):
             rotated = torch.rot90(observation, -element, (-2, -1))
-            image = rotated.flip(-1) if self.group.flips(element) else rotated
+            image = rotated.flip(-1) if self.group.reflects(element) else rotated
             vector = state @ self.state_rep[element]  # orthogonal: its inverse times the state
             features.append(self.joint_net(torch.cat([self.image_net(image), vector], dim=1)))
         return torch.stack(features, dim=1)

@@ -189,7 +189,7 @@ class SymviewPolicy(PreTrainedPolicy):
         if self.config.augmentation == "none":
             return None
         group = make_group(self.config.group)
-        elements = AUGMENTATIONS | {"group": (group.turns, group.mirrors)}
+        elements = AUGMENTATIONS | {"group": (group.rotations, group.reflections)}
         return random_transform(*elements[self.config.augmentation], like)
 
     def network_input(

@@ -23,7 +23,7 @@ IMAGES = torch.rand(2, 3, 12, 12, generator=torch.Generator().manual_seed(0), dt
 @pytest.mark.parametrize("element", range(8))
 def test_elements_of_d4_move_pixels_onto_pixels(element):
     group = make_group("D4")
-    flipped = IMAGES.flip(-1) if group.flips(element) else IMAGES
+    flipped = IMAGES.flip(-1) if group.reflects(element) else IMAGES
     moved = transform_images(IMAGES, PlanarTransform.of_element(group, element, IMAGES.flatten(1)))
     torch.testing.assert_close(moved, torch.rot90(flipped, element % 4, (-2, -1)))
 
