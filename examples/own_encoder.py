@@ -23,7 +23,7 @@ from lerobot_policy_symview.symmetry.groups import PlanarGroup
 logger = logging.getLogger(__name__)
 
 
-@register_encoder("moved")
+@register_encoder("transformed")
 class TransformedScenes(Encoder):
     """Features (B, G, n): one network's features of the scene, transformed by the inverse of each group element."""
 
@@ -52,7 +52,7 @@ if __name__ == "__main__":
     args = parser.parse_args()
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)
-    for encoder in ("moved", "plain"):
+    for encoder in ("transformed", "plain"):
         config = SymviewBcConfig(device="cpu", encoder=encoder, width=args.width, crop_size=64)
         config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (5,))}
         errors = equivariance_errors(SymviewBcPolicy(config))

@@ -51,7 +51,7 @@ TRIALS = {
         ),
         ("real/meta/info.json", "real_views/meta/symview_views.json"),
     ),
-    "own_encoder": Trial("--width=16", (r"moved: errors up to \de-0[67]$", r"plain: errors up to \de[+-]0[01]$")),
+    "own_encoder": Trial("--width=16", (r"transformed: errors up to \de-0[67]$", r"plain: errors up to \de[+-]0[01]$")),
     "own_robot": Trial(
         "--width=16",
         (

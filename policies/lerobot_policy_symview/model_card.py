@@ -37,9 +37,9 @@ def model_card(
         config: the policy's configuration.
         parameters: number of trained parameters.
         dataset: repository of the training data.
-        training: name -> value of further facts about the training.
-        evaluation: `step`, `success` and `return` of every evaluation.
-        tags: further tags.
+        training: name -> value, further facts about the training.
+        evaluation: `step`, `success` in [0, 1] and discounted `return` of each evaluation.
+        tags: tags beside those of every policy.
     """
     data = ModelCardData(
         license=config.license or "apache-2.0",
