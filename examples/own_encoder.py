@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 @register_encoder("transformed")
 class TransformedScenes(Encoder):
-    """Features (B, G, n): one network's features of the scene, transformed by the inverse of each group element."""
+    """Features (B, G, n): the same network applied to the scene, transformed by the inverse of each group element."""
 
     def __init__(self, config: SymviewBcConfig, group: PlanarGroup, state: np.ndarray):
         super().__init__(group, config.width)

@@ -42,8 +42,8 @@ class Cloud:
             rank = torch.rand(self.valid.shape, device=self.valid.device)
         else:
             rank = torch.rand(self.valid.shape[1], generator=torch.Generator().manual_seed(0)).to(self.valid.device)
-        wanted = min(count, self.valid.shape[1])
-        order = torch.where(self.valid, rank, 2.0).topk(wanted, dim=1, largest=False).indices
+        distinct = min(count, self.valid.shape[1])
+        order = torch.where(self.valid, rank, 2.0).topk(distinct, dim=1, largest=False).indices
         available = self.valid.sum(dim=1, keepdim=True).clamp(min=1)
         chosen = order.gather(1, torch.arange(count, device=order.device)[None] % available)
         points = torch.cat([self.position.to(self.color.dtype), self.color], dim=-1)
