@@ -23,9 +23,9 @@ from lerobot_policy_symview.symmetry.groups import PlanarGroup
 logger = logging.getLogger(__name__)
 
 
-@register_encoder("moved")
+@register_encoder("transformed")
 class TransformedScenes(Encoder):
-    """Features (B, G, n): one network's features of the scene, transformed by the inverse of each group element."""
+    """Features (B, G, n): the same network applied to the scene, transformed by the inverse of each group element."""
 
     def __init__(self, config: SymviewBcConfig, group: PlanarGroup, state: np.ndarray):
         super().__init__(group, config.width)
@@ -40,7 +40,7 @@ class TransformedScenes(Encoder):
         features = []
         for element in range(self.group.size):
             rotated = torch.rot90(observation, -element, (-2, -1))
-            image = rotated.flip(-1) if self.group.flips(element) else rotated
+            image = rotated.flip(-1) if self.group.reflects(element) else rotated
             vector = state @ self.state_rep[element]  # orthogonal: its inverse times the state
             features.append(self.joint_net(torch.cat([self.image_net(image), vector], dim=1)))
         return torch.stack(features, dim=1)
@@ -52,7 +52,7 @@ if __name__ == "__main__":
     args = parser.parse_args()
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)
-    for encoder in ("moved", "plain"):
+    for encoder in ("transformed", "plain"):
         config = SymviewBcConfig(device="cpu", encoder=encoder, width=args.width, crop_size=64)
         config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (5,))}
         errors = equivariance_errors(SymviewBcPolicy(config))

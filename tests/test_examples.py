@@ -1,4 +1,4 @@
-"""Every example, run as a user runs it, at a size of seconds. A new one is tested by existing."""
+"""Runs every script in `examples/` as a user does, at a scale of seconds; a new script needs an entry in `TRIALS`."""
 
 import ast
 import logging
@@ -27,14 +27,14 @@ ONLINE = ("push_to_the_hub",)
 
 @dataclass(frozen=True)
 class Trial:
-    """How an example is tried, and what must come of it."""
+    """How an example is run, and its expected results."""
 
     arguments: str
     """Its command line, with the folders `recorded`, `with_views` and `output`."""
-    tells: tuple[str, ...]
-    """Regular expressions of lines that it says."""
-    leaves: tuple[str, ...] = ()
-    """Files in `output`."""
+    log_lines: tuple[str, ...]
+    """Regular expressions of lines that it logs."""
+    files: tuple[str, ...] = ()
+    """Files that it writes to `output`."""
 
 
 TRIALS = {
@@ -51,7 +51,7 @@ TRIALS = {
         ),
         ("real/meta/info.json", "real_views/meta/symview_views.json"),
     ),
-    "own_encoder": Trial("--width=16", (r"moved: errors up to \de-0[67]$", r"plain: errors up to \de[+-]0[01]$")),
+    "own_encoder": Trial("--width=16", (r"transformed: errors up to \de-0[67]$", r"plain: errors up to \de[+-]0[01]$")),
     "own_robot": Trial(
         "--width=16",
         (
@@ -109,8 +109,8 @@ TRIALS = {
 
 
 @pytest.fixture
-def without_trace():
-    """Forget the names that an example registers, and what it and LeRobot's training make of the root logger."""
+def isolated_registrations_and_loggers():
+    """Undo an example's registrations and its, or LeRobot's, changes to the root logger."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     with temporary_registrations():
@@ -119,30 +119,30 @@ def without_trace():
 
 
 @pytest.fixture
-def run(recorded, with_views, tmp_path, monkeypatch, caplog, without_trace):
-    """Return a function that runs an example and returns what it says."""
+def run(recorded, with_views, tmp_path, monkeypatch, caplog, isolated_registrations_and_loggers):
+    """Return a function that runs an example and returns its log messages."""
 
     def run(name, arguments):
-        given = arguments.format(recorded=recorded, with_views=with_views, output=tmp_path)
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *given.split()])
+        command_line = arguments.format(recorded=recorded, with_views=with_views, output=tmp_path)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *command_line.split()])
         caplog.set_level(logging.INFO, "__main__")
-        own = logging.getLogger("__main__")
-        own.addHandler(caplog.handler)  # which the example takes from the root
+        example_logger = logging.getLogger("__main__")
+        example_logger.addHandler(caplog.handler)  # the example removes it from the root logger
         try:
             runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
         finally:
-            own.removeHandler(caplog.handler)
+            example_logger.removeHandler(caplog.handler)
         return "\n".join(dict.fromkeys(record.getMessage() for record in caplog.records if record.name == "__main__"))
 
     return run
 
 
-def test_every_example_is_tried():
+def test_every_example_has_a_trial():
     assert set(NAMES) == set(TRIALS)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_example_is_short_and_says_how_to_run_it(name):
+def test_example_is_short_and_documents_its_command(name):
     text = (EXAMPLES / f"{name}.py").read_text()
     assert len(text.splitlines()) <= LONGEST
     assert text.startswith('"""')
@@ -150,22 +150,22 @@ def test_an_example_is_short_and_says_how_to_run_it(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_an_example_does_what_it_says(name, run, tmp_path):
+def test_example_runs_with_the_expected_results(name, run, tmp_path):
     trial = TRIALS[name]
     with ExitStack() as stack:
         if name in ONLINE:
             stack.enter_context(online(stack.enter_context(HubServer()), ALICE))
-        said = run(name, trial.arguments)
-    for pattern in trial.tells:
-        assert re.search(pattern, said, re.MULTILINE), said
-    for file in trial.leaves:
+        log = run(name, trial.arguments)
+    for pattern in trial.log_lines:
+        assert re.search(pattern, log, re.MULTILINE), log
+    for file in trial.files:
         assert (tmp_path / file).stat().st_size > 0
 
 
-def test_the_block_is_found_where_it_lies(run):
+def test_view_of_one_image_locates_the_block(run):
     env = EnvSettings("block_picking").make()
     env.reset(seed=5)
-    lies = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
+    position = env.scene.pose(env.scene.client.getNumBodies() - 1)[0][:2]
     env.close()
-    found = re.search(r"x = (\S+) m, y = (\S+) m", run("view_of_one_image", "--seed=5 --output={output}/views.png"))
-    np.testing.assert_allclose([float(number) for number in found.groups()], lies, atol=0.005)
+    estimate = re.search(r"x = (\S+) m, y = (\S+) m", run("view_of_one_image", "--seed=5 --output={output}/views.png"))
+    np.testing.assert_allclose([float(number) for number in estimate.groups()], position, atol=0.005)

@@ -1,4 +1,4 @@
-"""A task, a view and an encoder of another package, which are there because it is installed."""
+"""A task, a view and an encoder of another installed package, known by its entry points."""
 
 import json
 import sys
@@ -27,11 +27,11 @@ MODULE = """
 
 
     class EasyPicking(BlockPicking):
-        instruction = "Pick up the red block, which lies in the middle."
+        instruction = "Pick up the red block, which lies in the centre."
 
         def spawn(self, scene, rng):
-            place = (*scene.workspace.center, 0.025)
-            self._cube = scene.add_box((0.05, 0.05, 0.05), 0.1, 1.0, (0.9, 0.1, 0.1), place, rng.uniform(-0.7, 0.7))
+            position = (*scene.workspace.center, 0.025)
+            self._cube = scene.add_box((0.05, 0.05, 0.05), 0.1, 1.0, (0.9, 0.1, 0.1), position, rng.uniform(-0.7, 0.7))
 
 
     @dataclass(frozen=True)
@@ -49,8 +49,8 @@ MODULE = """
             super().__init__(group, config.width)
             self.linear = torch.nn.Linear(config.channels + len(state[0]), config.width)
 
-        def forward(self, picture, state):
-            features = self.linear(torch.cat([picture.mean(dim=(2, 3)), state], dim=1))
+        def forward(self, observation, state):
+            features = self.linear(torch.cat([observation.mean(dim=(2, 3)), state], dim=1))
             return features[:, None].expand(-1, self.group.size, -1)
 """
 ENTRY_POINTS = {
@@ -72,14 +72,14 @@ def other_package(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("other_package")
-def test_another_packages_task_view_and_encoder_go_all_the_way(tmp_path, monkeypatch):
-    recorded, seen = tmp_path / "recorded", tmp_path / "seen"
+def test_task_view_and_encoder_of_another_package_work_end_to_end(tmp_path, monkeypatch):
+    recorded, views = tmp_path / "recorded", tmp_path / "views"
     env = RecordedEnv(task="easy_picking", oracle=False)
     generate(GenerateConfig(NewDataset("test/recorded", recorded), env=env, num_episodes=2, num_workers=2))
     source = HubDataset("test/recorded", recorded)
-    add_views(AddViewsConfig(source, new_repo_id="test/seen", new_root=seen, views=["grey"], num_workers=2))
+    add_views(AddViewsConfig(source, new_repo_id="test/views", new_root=views, views=["grey"], num_workers=2))
     options = ("--policy.view=grey", "--policy.modality=rgb", "--policy.gripper_input=none", "--policy.encoder=mean")
-    checkpoint = train(monkeypatch, seen, tmp_path / "policy", *options)
+    checkpoint = train(monkeypatch, views, tmp_path / "policy", *options)
     arguments = ["lerobot-eval", f"--policy.path={checkpoint}", "--policy.device=cpu", "--env.type=symview"]
     arguments += ["--env.task=easy_picking", "--env.max_steps=2", "--eval.n_episodes=2", "--eval.batch_size=2"]
     arguments += [f"--output_dir={tmp_path / 'eval'}"]
@@ -89,6 +89,6 @@ def test_another_packages_task_view_and_encoder_go_all_the_way(tmp_path, monkeyp
 
 
 @pytest.mark.usefixtures("other_package")
-def test_their_names_are_suggested_too():
+def test_names_of_another_package_are_suggested():
     with pytest.raises(ValueError, match="did you mean 'easy_picking'"):
         RecordedEnv(task="easy_piking")

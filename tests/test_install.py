@@ -1,4 +1,4 @@
-"""The wheel and the source archive hold what users need, and pip alone installs the wheel and runs it."""
+"""The contents of the wheel and the source archive, and the installation of the wheel with pip alone."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ OURS = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "PIP_CONSTRAINT", "UV_CONSTRA
 
 
 def run(*command, fails=False):
-    """Run a command outside this environment; return its standard output, or its standard error if it must fail."""
+    """Run a command outside this environment; return its standard output, or its standard error with `fails`."""
     clean = {name: value for name, value in os.environ.items() if name not in OURS}
     words = [str(word) for word in command]
     done = subprocess.run(words, capture_output=True, text=True, env=clean, cwd=ROOT, check=False)
@@ -42,12 +42,12 @@ def archives(tmp_path_factory):
 
 
 def files(package):
-    """Return every file of a package that git knows, by its place in the wheel."""
+    """Return the paths in the wheel of a package's files, as git lists them."""
     listed = subprocess.check_output(["git", "ls-files", "-z", PACKAGES[package]], cwd=ROOT, text=True)
     return {f"{package}/{name.removeprefix(PACKAGES[package] + '/')}" for name in listed.split("\0") if name}
 
 
-def test_the_wheel_holds_every_file_of_every_package_and_nothing_else(archives):
+def test_wheel_has_exactly_the_files_of_the_packages(archives):
     (wheel,) = archives.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     expected = set().union(*(files(package) for package in PACKAGES))
@@ -57,28 +57,28 @@ def test_the_wheel_holds_every_file_of_every_package_and_nothing_else(archives):
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
 
 
-def test_the_source_archive_holds_the_packages_and_no_tests(archives):
+def test_source_archive_has_the_packages_and_no_tests(archives):
     (archive,) = archives.glob("*.tar.gz")
     with tarfile.open(archive) as stream:
         names = {name.partition("/")[2] for name in stream.getnames()}
     assert {"pyproject.toml", "constraints.txt", "LICENSE", "README.md"} <= names
-    for place in PACKAGES.values():
-        listed = subprocess.check_output(["git", "ls-files", "-z", place], cwd=ROOT, text=True)
+    for folder in PACKAGES.values():
+        listed = subprocess.check_output(["git", "ls-files", "-z", folder], cwd=ROOT, text=True)
         assert {name for name in listed.split("\0") if name} <= names
     assert not {name.split("/")[0] for name in names} & {".venv", ".tools", "tests", "results", "outputs", "data"}
 
 
 @pytest.fixture
 def programs():
-    """Make a fresh virtual environment and return the folder of its programs; 6 GB, so it is removed at once."""
+    """Make a fresh virtual environment, 6 GB, and return the folder of its programs; remove it after use."""
     with tempfile.TemporaryDirectory() as folder:
         venv.create(folder, with_pip=True)
         yield Path(folder) / "bin"
 
 
 @pytest.mark.install
-def test_pip_alone_installs_a_wheel_that_adds_views_and_trains(archives, programs, recorded, tmp_path):
-    """The versions are the registry's; PyBullet, whose compilation takes minutes, is left out."""
+def test_wheel_installed_with_pip_adds_views_and_trains(archives, programs, recorded, tmp_path):
+    """With the package index's versions and without PyBullet, whose compilation takes minutes."""
     (wheel,) = archives.glob("*.whl")
     run(programs / "python", "-m", "pip", "install", "--quiet", "--no-compile", wheel)
     run(programs / "python", "-m", "pip", "check")

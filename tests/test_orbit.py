@@ -27,7 +27,7 @@ def frames_of(path):
             yield np.asarray(animation.convert("RGB"), dtype=int)
 
 
-def test_the_side_image_changes_more_than_the_topdown_view(orbit, tmp_path):
+def test_side_image_changes_more_than_the_topdown_view(orbit, tmp_path):
     size = 96
     orbit.main(tmp_path / "orbit.gif", frames=4, size=size, frames_per_second=10)
     first, second, *_ = frames = list(frames_of(tmp_path / "orbit.gif"))
@@ -37,7 +37,7 @@ def test_the_side_image_changes_more_than_the_topdown_view(orbit, tmp_path):
     assert changed[:, orbit.MARGIN : left - orbit.MARGIN].mean() > 2 * changed[:, left : left + size].mean()
 
 
-def test_the_animation_is_deterministic(orbit, tmp_path):
+def test_animation_is_deterministic(orbit, tmp_path):
     for name in ("first.gif", "second.gif"):
         orbit.main(tmp_path / name, frames=2, size=48, frames_per_second=10)
     assert (tmp_path / "first.gif").read_bytes() == (tmp_path / "second.gif").read_bytes()

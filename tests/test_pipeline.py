@@ -1,4 +1,4 @@
-"""The pipeline as a user runs it: console commands in processes of their own, on a tiny dataset."""
+"""The pipeline as a user runs it: console commands, on a tiny dataset."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def tiny_demo(tmp_path_factory):
     return config
 
 
-def test_every_stage_leaves_its_result(tiny_demo):
+def test_every_stage_writes_its_result(tiny_demo):
     folder = tiny_demo.output_dir
     info = json.loads((folder / "views" / "meta" / "info.json").read_text())
     assert info["total_episodes"] == 2
@@ -53,7 +53,7 @@ def test_every_stage_leaves_its_result(tiny_demo):
     assert read_success(folder / "evaluation").episodes == 2
 
 
-def test_the_report_stands_alone(tiny_demo):
+def test_report_is_self_contained(tiny_demo):
     page = (tiny_demo.output_dir / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert page.count("data:video/mp4;base64,") == 2
@@ -64,7 +64,7 @@ def test_the_report_stands_alone(tiny_demo):
     assert "href=" not in page
 
 
-def test_a_second_run_redoes_nothing(tiny_demo):
+def test_second_run_repeats_no_stage(tiny_demo):
     folder = tiny_demo.output_dir
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
     record = (folder / "stages.json").read_text()
@@ -73,7 +73,7 @@ def test_a_second_run_redoes_nothing(tiny_demo):
     assert (folder / "stages.json").read_text() == record
 
 
-def test_a_checkpoint_is_evaluated_on_several_tasks_at_once(tiny_demo, tmp_path, monkeypatch):
+def test_checkpoint_is_evaluated_on_several_tasks(tiny_demo, tmp_path, monkeypatch):
     arguments = [
         "lerobot-eval",
         f"--policy.path={tiny_demo.output_dir / 'policy' / 'checkpoints' / 'last' / 'pretrained_model'}",
@@ -99,12 +99,12 @@ def test_a_checkpoint_is_evaluated_on_several_tasks_at_once(tiny_demo, tmp_path,
         (lerobot_eval.main, ("--env.task", "--env.camera.elevation_deg", "--env.oracle", "--env.views")),
     ],
 )
-def test_lerobots_commands_list_our_options(command, options, monkeypatch, capsys):
+def test_help_of_lerobots_commands_lists_the_plugins_options(command, options, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["lerobot", "--policy.type=symview_bc", "--env.type=symview", "--help"])
     with pytest.raises(SystemExit, match="0"):
         command()
-    shown = capsys.readouterr().out
-    assert [option for option in options if option not in shown] == []
+    help_text = capsys.readouterr().out
+    assert [option for option in options if option not in help_text] == []
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_lerobots_commands_list_our_options(command, options, monkeypatch, capsy
         (("symview-demo", "--steps=0"), 2, "--steps must be at least 1, got 0"),
     ],
 )
-def test_a_users_mistake_is_one_line(command, code, message):
+def test_user_errors_are_one_line(command, code, message):
     result = run(*command)
     assert result.returncode == code
     assert message in result.stderr
@@ -135,24 +135,24 @@ def test_a_users_mistake_is_one_line(command, code, message):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_commands_explain_themselves(command, monkeypatch, capsys):
+def test_commands_have_help_and_version(command, monkeypatch, capsys):
     (script,) = entry_points(group="console_scripts", name=command)
-    for flag, begins in (("--help", ""), ("--version", f"{command} 0.")):
+    for flag, prefix in (("--help", ""), ("--version", f"{command} 0.")):
         monkeypatch.setattr(sys, "argv", [command, flag])
         with pytest.raises(SystemExit, match="0"):
             script.load()()
-        shown = capsys.readouterr().out
-        assert shown.startswith(begins)
-        assert flag == "--version" or ("examples:" in shown and f"  {command}" in shown)
+        output = capsys.readouterr().out
+        assert output.startswith(prefix)
+        assert flag == "--version" or ("examples:" in output and f"  {command}" in output)
 
 
-def test_a_preview_is_a_picture_a_page_and_a_recording(recorded, tmp_path):
+def test_preview_writes_an_image_a_page_and_a_rerun_recording(recorded, tmp_path):
     from PIL import Image
 
     result = run("symview-preview", "--dataset.repo_id=test/r", f"--root={recorded}", f"--output_dir={tmp_path}")
     assert result.returncode == 0, result.stderr
     assert "px/mm" in result.stderr
-    with Image.open(tmp_path / "preview.png") as picture:
-        assert picture.size[0] > 1000
+    with Image.open(tmp_path / "preview.png") as image:
+        assert image.size[0] > 1000
     assert (tmp_path / "preview.html").read_text().count("data:image/png;base64,") == 4 * 7
     assert (tmp_path / "preview.rrd").stat().st_size > 100_000

@@ -1,4 +1,4 @@
-"""Rules about the repository itself."""
+"""Rules for the repository: requirements, imports, packaging, README."""
 
 import ast
 import re
@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
-def test_versions_are_pinned_without_addresses():
+def test_versions_are_pinned_without_urls():
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if not line.startswith("#")]
     assert len(pins) > 50
@@ -22,19 +22,19 @@ def test_versions_are_pinned_without_addresses():
         assert re.fullmatch(r"[A-Za-z0-9_.\-]+==[^ /]+( ; .+)?", pin), pin
 
 
-def test_what_is_installed_at_run_time_has_ranges_and_no_escnn():
+def test_runtime_requirements_are_ranges_without_escnn():
     requirements = PYPROJECT["project"]["dependencies"]
-    assert not [one for one in requirements if "==" in one or one.startswith("escnn")]
+    assert not [line for line in requirements if "==" in line or line.startswith("escnn")]
     assert "constraint-dependencies" not in PYPROJECT["tool"]["uv"]
 
 
 def test_every_imported_package_is_required():
-    """Of the packages that an extra installs, `symview_eval.commands` knows which."""
+    """By the project or by an extra; `symview_eval.commands` knows which packages need an extra."""
     modules = {"cv2": "opencv-python-headless", "PIL": "pillow", "yaml": "pyyaml", "pybullet_data": "pybullet",
                "pybullet_utils": "pybullet", "rerun": "lerobot", "wandb": "lerobot"}  # fmt: skip
     project = PYPROJECT["project"]
     required = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
-    names = {re.match(r"[\w.-]+", one)[0].lower().replace("_", "-") for one in required}
+    names = {re.match(r"[\w.-]+", requirement)[0].lower().replace("_", "-") for requirement in required}
     ours = {"lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval"}
     for package in PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]:
         for path in (ROOT / package).rglob("*.py"):
@@ -43,7 +43,7 @@ def test_every_imported_package_is_required():
                     assert modules.get(name, name).replace("_", "-") in names, f"{path} imports {name}"
 
 
-def test_only_its_own_modules_import_escnn():
+def test_only_escnn_import_imports_escnn():
     files = subprocess.check_output(
         ["git", "grep", "-lE", r"^\s*(from|import) escnn", "--", "*.py"], cwd=ROOT, text=True
     )
@@ -62,7 +62,7 @@ PACKAGES = {
     "lerobot_policy_symview": "policies/lerobot_policy_symview",
     "symview_eval": "eval/symview_eval",
 }
-ARROWS = {
+ALLOWED_IMPORTS = {
     "symview_sim": {"lerobot_symview"},
     "lerobot_policy_symview": {"lerobot_symview", "symview_sim"},
     "symview_eval": {"lerobot_symview", "symview_sim", "lerobot_policy_symview"},
@@ -80,12 +80,12 @@ ARROWS = {
     "lerobot_policy_symview.inputs": {"configuration", "symmetry"},
     "lerobot_policy_symview.nn": {"configuration", "encoders", "inputs", "symmetry"},
 }
-"""Package -> the packages it may import; of a room, the rooms of its own package. Every arrow points the same way."""
+"""Package -> the packages it may import; subpackage -> the subpackages of its own package. There are no cycles."""
 FORBIDDEN = {"lerobot_symview.geometry": {"lerobot", "draccus"}, "lerobot_symview.views": {"lerobot", "draccus"}}
 
 
 def imported_modules(path):
-    """Names of the modules that a file imports at run time, wherever in it."""
+    """Yield the names of the modules that a file imports at run time, at any level."""
     tree = ast.parse(path.read_text())
     typing_only = [
         node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
@@ -100,31 +100,31 @@ def imported_modules(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def room_files(room):
-    package, *rest = room.split(".")
+def files_of(subpackage):
+    package, *rest = subpackage.split(".")
     base = ROOT / PACKAGES[package] / Path(*rest)
     return sorted(base.rglob("*.py")) if base.is_dir() else [base.with_suffix(".py")]
 
 
-@pytest.mark.parametrize("room", ARROWS)
-def test_imports_go_one_way(room):
-    package, _, inner = room.partition(".")
-    for path in room_files(room):
+@pytest.mark.parametrize("subpackage", ALLOWED_IMPORTS)
+def test_imports_follow_the_allowed_direction(subpackage):
+    package, _, inner = subpackage.partition(".")
+    for path in files_of(subpackage):
         for module in imported_modules(path):
             owner = module.split(".")[0]
-            assert owner not in FORBIDDEN.get(room, ()), f"{path} imports {module}"
+            assert owner not in FORBIDDEN.get(subpackage, ()), f"{path} imports {module}"
             if not inner:
-                assert owner not in set(PACKAGES) - ARROWS[room] - {package}, f"{path} imports {module}"
+                assert owner not in set(PACKAGES) - ALLOWED_IMPORTS[subpackage] - {package}, f"{path} imports {module}"
             elif owner == package and f"{module}.".removeprefix(f"{package}.").split(".")[0] != inner:
-                allowed = [f"{package}.{name}." for name in ARROWS[room]]
+                allowed = [f"{package}.{name}." for name in ALLOWED_IMPORTS[subpackage]]
                 assert f"{module}.".startswith(tuple(allowed)), f"{path} imports {module}"
 
 
-@pytest.mark.parametrize("room", ["geometry", "views", "calibration", "datasets"])
-def test_the_library_knows_no_flags(room):
-    """Commands add the flag to an error; `add_views` and `hub` are commands, a card shows commands."""
+@pytest.mark.parametrize("subpackage", ["geometry", "views", "calibration", "datasets"])
+def test_library_errors_name_no_flags(subpackage):
+    """Commands add the flag to an error. `add_views` and `hub` are commands, and a dataset card shows commands."""
     commands = {"add_views.py", "hub.py", "card.py"}
-    for path in room_files(f"lerobot_symview.{room}"):
+    for path in files_of(f"lerobot_symview.{subpackage}"):
         tree = ast.parse(path.read_text())
         raised = [node for node in ast.walk(tree) if isinstance(node, ast.Raise)]
         texts = [part.value for node in raised for part in ast.walk(node) if isinstance(part, ast.Constant)]
@@ -132,13 +132,13 @@ def test_the_library_knows_no_flags(room):
             assert not [text for text in texts if re.search(r"--[a-z]", str(text))], path
 
 
-def test_the_readme_shows_the_commands_the_demo_runs():
+def test_readme_shows_the_commands_of_the_demo():
     readme = (ROOT / "README.md").read_text()
     for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval", "symview-preview"):
         assert f"\n{command} " in readme
 
 
-def test_the_readme_is_short_and_its_files_exist():
+def test_readme_is_short_and_its_links_exist():
     readme = (ROOT / "README.md").read_text()
     assert len(readme.splitlines()) <= 120
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", readme):
@@ -146,7 +146,7 @@ def test_the_readme_is_short_and_its_files_exist():
     assert (ROOT / "docs" / "images" / "orbit.gif").stat().st_size < 10**6
 
 
-def test_public_names_are_there_and_simulators_start_without_numba():
+def test_public_names_exist_and_simulators_import_without_numba():
     import lerobot_symview
 
     assert all(getattr(lerobot_symview, name) is not None for name in dir(lerobot_symview))
@@ -154,7 +154,7 @@ def test_public_names_are_there_and_simulators_start_without_numba():
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
-def test_the_plugin_loads_without_what_only_networks_views_and_simulators_need():
+def test_plugin_import_skips_network_view_and_simulator_modules():
     slow = "{'numba', 'escnn', 'pybullet', 'symview_sim.env', 'lerobot_policy_symview.modeling_symview_bc'}"
     check = f"import sys, lerobot_policy_symview; sys.exit(', '.join({slow} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)

@@ -8,9 +8,9 @@ from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.encoders import register_encoder
 from lerobot_policy_symview.env_symview import SymviewEnvConfig
-from lerobot_policy_symview.processor_allowlist import import_no_steps
+from lerobot_policy_symview.processor_allowlist import restrict_processor_steps
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
-import_no_steps()
+restrict_processor_steps()
 
 __all__ = ["SymviewBcConfig", "SymviewEnvConfig", "SymviewSacfdConfig", "ViewsProcessorStep", "register_encoder"]

@@ -21,9 +21,9 @@ class SymviewBcConfig(SymviewConfig):
     learning_rate_decay: Literal["none", "cosine"] = "none"
     """`cosine` anneals the learning rate to zero; `none` keeps it constant, as in the paper."""
     aperture_noise: float = 0.0
-    """Standard deviation of noise on the state's `aperture` dimensions in training, in their unit. An expert opens the
-    gripper to exactly the same aperture every time, a policy does not: without noise its own apertures are out of
-    distribution."""
+    """Standard deviation of Gaussian noise on the state's `aperture` dimensions in training, in their unit. An expert
+    opens the gripper to exactly the same aperture every time, a policy does not: without noise, the policy's own
+    apertures are out of distribution."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""The encoders that `--policy.encoder` chooses from; importing this module imports neither torch nor an encoder."""
+"""Registry of the encoders that `--policy.encoder` selects; importing it imports neither torch nor an encoder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lerobot_policy_symview.symmetry.groups import PlanarGroup
 
 EncoderFactory = Callable[..., Any]
-"""Called with the policy's configuration, its group and the state's representation (G, D, D); returns an `Encoder`."""
+"""Takes the policy's configuration, its group and the state's representation (G, D, D); returns an `Encoder`."""
 
 _CONVOLUTIONAL = "lerobot_policy_symview.nn.encoders.convolutional"
 ENCODERS: Registry[EncoderFactory] = Registry(
@@ -39,8 +39,8 @@ def make_encoder(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.fl
 
     Args:
         config: the policy's configuration.
-        group: G elements.
-        state: (G, D, D), representation of the state vector that enters beside the observation.
+        group: the symmetry group, of G elements.
+        state: (G, D, D), the representation of the state vector, which is the network's second input.
 
     Raises:
         ValueError: if no encoder has that name.

@@ -19,28 +19,28 @@ from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_sim.settings import EnvSettings
 
-# What a simulator process imports; loaded once by the fork server instead of six seconds in each process.
+# The modules of a simulator process: the fork server imports them once, instead of six seconds in each process.
 PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
 
 
 @EnvConfig.register_subclass("symview")
 @dataclass
 class SymviewEnvConfig(EnvSettings, EnvConfig):
-    """PyBullet tabletop tasks seen by freely placed RGBD cameras."""
+    """PyBullet tabletop tasks, observed by freely placed RGBD cameras."""
 
     task: str = "block_picking"
-    """Task, such as `block_picking`; several separated by commas, or `all`."""
+    """Name of the task, such as `block_picking`; several names separated by commas; or `all`."""
     fps: int = 4
-    """Actions per second of a robot that takes as long as the simulated one."""
+    """Actions per second, the simulated robot's speed."""
     views: list[ViewSpec] = field(default_factory=list)
-    """Views of the first camera to add to each observation, for policies that do not make their own: by name or with
-    options, `[reproj, {name: persp, plane_height: 0.025}]`."""
+    """Views of the first camera to add to each observation, for policies that do not render their own: names, or names
+    with options, `[reproj, {name: persp, plane_height: 0.025}]`."""
     view_size: int | None = None
-    """Rows and columns of the views that do not have a size of their own in `views`."""
+    """Rows and columns of the views for which `views` gives no size."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
-    """Options of the view reproj."""
+    """Options of the view `reproj`."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
-    """Options of the view persp."""
+    """Options of the view `persp`."""
 
     def __post_init__(self) -> None:
         self.settings()  # checks the fields for every task
@@ -70,8 +70,9 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """The fields of `EnvSettings` but the task."""
-        return {entry.name: getattr(self, entry.name) for entry in fields(EnvSettings) if entry.name != "task"}
+        """The fields of `EnvSettings` except the task."""
+        names = [setting.name for setting in fields(EnvSettings) if setting.name != "task"]
+        return {name: getattr(self, name) for name in names}
 
     @property
     def tasks(self) -> list[str]:
@@ -81,7 +82,7 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
         return list(TASK_NAMES) if self.task == "all" else [name.strip() for name in self.task.split(",")]
 
     def settings(self) -> dict[str, EnvSettings]:
-        """Return the settings of every task."""
+        """Return task -> settings."""
         return {task: EnvSettings(task=task, **self.gym_kwargs) for task in self.tasks}
 
     def create_envs(
@@ -89,20 +90,20 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
         """Return `{task: {0: a vector environment of n_envs}}`.
 
-        Asynchronous environments, used only where there are several, start their processes at the first reset, so that
-        a suite never runs the processes of more than one task.
+        Asynchronous environments, used only for `n_envs` above 1, start their processes at the first reset, so that a
+        suite runs the processes of only one task at a time.
         """
         if not use_async_envs or n_envs == 1:
             return {
-                task: {0: gymnasium.vector.SyncVectorEnv([freeze_after_episode_end(one.make)] * n_envs)}
-                for task, one in self.settings().items()
+                task: {0: gymnasium.vector.SyncVectorEnv([freeze_after_episode_end(settings.make)] * n_envs)}
+                for task, settings in self.settings().items()
             }
         multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
         # A bound method of plain settings: simulator processes unpickle it without importing LeRobot's registries.
-        return {task: {0: _LazyAsyncVectorEnv([one.make] * n_envs)} for task, one in self.settings().items()}
+        return {task: {0: _LazyAsyncVectorEnv([settings.make] * n_envs)} for task, settings in self.settings().items()}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """Return the pipeline that adds `views` and declares depth to be metres, and the identity for actions."""
+        """Return the preprocessor, which adds `views` and declares depth in metres, and an empty postprocessor."""
         views = [ViewSpec(name, asdict(view)).plain() for name, view in self._make_views().items()]
         depth_units: dict[str, Unit] = dict.fromkeys((key for key in self.features if key.endswith("_depth")), "m")
         step = ViewsProcessorStep(

@@ -132,7 +132,7 @@ def transform_observation(
         rotation[:2, :2] = torch.from_numpy(group.rotation()[element])
         pose[:, :3, :3] = rotation @ pose[:, :3, :3]  # left-handed after a reflection, as the scene is
         pose[:, :3, 3] = (pose[:, :3, 3] - center) @ rotation.T + center
-        if is_raw and group.flips(element):
+        if is_raw and group.reflects(element):
             transformed |= _reflected_image(observation, config)
             pose[:, :3, 0] *= -1  # right-handed again, as views require: the image is reflected instead
         transformed[key] = pose.flatten(1).to(observation[key].dtype)
@@ -178,8 +178,8 @@ def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float3
 def _transform_pixels(images: Tensor, group: PlanarGroup, element: int) -> Tensor:
     if not is_exact(group, element):
         return transform_images(images, PlanarTransform.of_element(group, element, images.flatten(1)))
-    flipped = images.flip(-1) if group.flips(element) else images
-    return torch.rot90(flipped, 4 * (element % group.turns) // group.turns, (-2, -1))
+    flipped = images.flip(-1) if group.reflects(element) else images
+    return torch.rot90(flipped, 4 * (element % group.rotations) // group.rotations, (-2, -1))
 
 
 def _blotches(batch: int, channels: int, side: int, generator: torch.Generator) -> Tensor:
@@ -195,10 +195,10 @@ def checked_group(config: SymviewConfig) -> PlanarGroup:
 
 def is_exact(group: PlanarGroup, element: int) -> bool:
     """Whether an element maps the pixels of a square image onto pixels."""
-    return 4 * (element % group.turns) % group.turns == 0
+    return 4 * (element % group.rotations) % group.rotations == 0
 
 
 def describe(group: PlanarGroup, element: int) -> str:
     """Return a description such as `reflected, rotated by 90 degrees`."""
-    reflected = "reflected, " if group.flips(element) else ""
-    return f"{reflected}rotated by {360 * (element % group.turns) / group.turns:g} degrees"
+    reflected = "reflected, " if group.reflects(element) else ""
+    return f"{reflected}rotated by {360 * (element % group.rotations) / group.rotations:g} degrees"

@@ -1,4 +1,4 @@
-"""The methods that the paper compares, each a setting of the policy's orthogonal options."""
+"""Presets of the policy's options for the methods that the paper compares."""
 
 from __future__ import annotations
 
@@ -24,4 +24,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "persp_equi_relaxed": PERSPECTIVE | RELAXED,
     "persp_equi_broken": PERSPECTIVE | BROKEN,
 }
-"""Tables 1 to 3. `persp_equi_broken`, with the direction to the camera, is what the paper proposes for RGB."""
+"""Method -> options of the policy, for the paper's Tables 1 to 3.
+
+For RGB, the paper proposes `persp_equi_broken`, whose network also gets the direction to the camera."""

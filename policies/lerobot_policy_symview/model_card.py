@@ -37,9 +37,9 @@ def model_card(
         config: the policy's configuration.
         parameters: number of trained parameters.
         dataset: repository of the training data.
-        training: name -> value of further facts about the training.
-        evaluation: `step`, `success` and `return` of every evaluation.
-        tags: further tags.
+        training: name -> value, further facts about the training.
+        evaluation: `step`, `success` in [0, 1] and discounted `return` of each evaluation.
+        tags: tags beside those of every policy.
     """
     data = ModelCardData(
         license=config.license or "apache-2.0",
@@ -59,7 +59,7 @@ def model_card(
         "## Inputs and outputs\n",
         f"The observation is {observation.format(camera=config.camera)} ({config.modality.upper()}, "
         f"{config.crop_size} pixels), and the state. The network ({config.encoder} encoder, group {config.group}, "
-        f"n = {config.width}, {parameters:,} parameters) is "
+        f"width {config.width}, {parameters:,} parameters) is "
         + ("not equivariant.\n" if config.group == "C1" else "equivariant: actions transform with the scene.\n"),
         "| feature | representation of each dimension |\n|---|---|",
         f"| `observation.state` | {', '.join(config.state_symmetry)} |",

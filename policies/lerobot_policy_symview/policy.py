@@ -1,6 +1,6 @@
-"""What the policies share: loading, acting, and the scaling of states and actions.
+"""Base class of the policies: loading, acting, and the scaling of states and actions.
 
-`lerobot_policy_symview.inputs.scene_input` forms what the network sees.
+`lerobot_policy_symview.inputs.scene_input` forms the network's input.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
-"""Returns a head for n regular fields and actions that transform by a representation (G, A, A)."""
+"""Takes n, the number of regular fields, and the actions' representation (G, A, A); returns the head."""
 
 
 class Network(nn.Module):
-    """An encoder and its head.
+    """An encoder and a head on its features.
 
     Args:
-        config: the policy's.
-        state_input: the vector beside the image.
+        config: the policy's configuration.
+        state_input: forms the state vector, the encoder's second input.
         make_head: makes the head.
     """
 
@@ -59,13 +59,14 @@ class Network(nn.Module):
 class SymviewPolicy(PreTrainedPolicy):
     """A reactive policy: one observation, one action, no memory.
 
-    Its inputs and outputs are physical: images in [0, 1], metres, radians. Everything between commutes with the
-    network's group: the centre crop, the drawn gripper, the scaling of states and actions.
+    Its inputs and outputs have physical units: images in [0, 1], metres, radians. Every operation between them commutes
+    with the network's group: the centre crop, the drawn gripper, the scaling of states and actions.
 
     Args:
-        config: the policy's.
+        config: the policy's configuration.
         make_head: makes the head.
-        dataset_stats: minimum and maximum of states and actions, which scale them.
+        dataset_stats: minimum and maximum of states and actions in the dataset, from which their scales follow; without
+            them states and actions are not scaled.
     """
 
     config_class: Any = SymviewConfig
@@ -93,17 +94,17 @@ class SymviewPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
-        """Load a policy as LeRobot does, after checking that its processor files name the policy's own steps only.
+        """Load a policy as LeRobot does, then check that its processor files name only the policy's own steps.
 
         Raises:
-            ValueError: if they name others.
+            ValueError: if a processor file names another step.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **options)
         check_processor_files(policy.config, str(pretrained_name_or_path), options)
         return policy
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load weights; an average that they lack is initialised with the weights."""
+        """Load weights; averaged weights that `state_dict` lacks are initialised with the trained ones."""
         if self.averaged is not None and not any(name.startswith("averaged.") for name in state_dict):
             trained = {name for name in state_dict if name.startswith("network.")}
             initial = {name.replace("network.", "averaged.", 1): state_dict[name].clone() for name in trained}
@@ -112,10 +113,10 @@ class SymviewPolicy(PreTrainedPolicy):
 
     @abstractmethod
     def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) that a network, the trained or the averaged one, takes in evaluation."""
+        """Return the scaled action (B, A) of a network in evaluation; it has the trained or the averaged weights."""
 
     def get_optim_params(self) -> Any:
-        """Return all trained parameters; they share one learning rate."""
+        """Return all trained parameters; they share a learning rate."""
         return self.network.parameters()
 
     def update(self) -> None:
@@ -142,7 +143,7 @@ class SymviewPolicy(PreTrainedPolicy):
         cfg: Any = None,
         dataset_meta: Any = None,
     ) -> ModelCard:
-        """Return the card that `lerobot-train` pushes with the policy."""
+        """Return the model card that `lerobot-train` uploads with the policy."""
         training = {} if cfg is None else {"steps": cfg.steps, "batch size": cfg.batch_size, "seed": cfg.seed}
         if dataset_meta is not None:
             training = {"episodes": dataset_meta.total_episodes, "frames": dataset_meta.total_frames} | training
@@ -163,12 +164,12 @@ class SymviewPolicy(PreTrainedPolicy):
         return self.physical(scaled)
 
     def precision(self) -> AbstractContextManager[Any]:
-        """Return the context in which networks compute: bfloat16 where the configuration says so."""
+        """Return the autocast context of the network: bfloat16 with `--policy.dtype=bfloat16`, else none."""
         reduced = self.config.dtype == "bfloat16"
         return torch.autocast(self.action_center.device.type, torch.bfloat16) if reduced else nullcontext()
 
     def scaled(self, action: Tensor) -> Tensor:
-        """Scale actions (B, A): the centre of their range becomes 0, its ends -1 and 1."""
+        """Scale actions (B, A): the centre of each range maps to 0, its ends to -1 and 1."""
         return (action - self.action_center) / self.action_width
 
     def physical(self, scaled: Tensor) -> Tensor:
@@ -176,7 +177,7 @@ class SymviewPolicy(PreTrainedPolicy):
         return scaled * self.action_width + self.action_center
 
     def training_input(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return `network_input` and scaled actions (B, A), with random transforms and crops if the policy trains."""
+        """Return `network_input` and scaled actions (B, A), randomly transformed and cropped in training mode."""
         state, action, transform, crop_offset = batch[keys.STATE], batch[keys.ACTION], None, None
         if self.training:
             transform, crop_offset = self.random_transform(state), torch.rand(len(state), 2, device=state.device)
@@ -185,21 +186,21 @@ class SymviewPolicy(PreTrainedPolicy):
         return *self.network_input(batch, transform, crop_offset), self.scaled(action)
 
     def random_transform(self, like: Tensor) -> PlanarTransform | None:
-        """Draw the transform by which `augmentation` changes each sample of `like` (B, ...); None without one."""
+        """Draw a transform for each sample of `like` (B, ...), as `augmentation` says; None without augmentation."""
         if self.config.augmentation == "none":
             return None
         group = make_group(self.config.group)
-        elements = AUGMENTATIONS | {"group": (group.turns, group.mirrors)}
+        elements = AUGMENTATIONS | {"group": (group.rotations, group.reflections)}
         return random_transform(*elements[self.config.augmentation], like)
 
     def network_input(
         self, batch: dict[str, Tensor], transform: PlanarTransform | None = None, crop_offset: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return the observation and the state (B, D) that the network gets.
+        """Return the network's input: the observation and the state (B, D).
 
         Args:
             batch: preprocessed observations.
-            transform: of the scene before it is seen.
+            transform: planar transform of each scene; by default none.
             crop_offset: (B, 2) in [0, 1), row and column relative to the largest offset; by default the centre crop.
         """
         observation, state = self.scene.form(batch, transform, crop_offset, shuffle=self.training)

@@ -1,8 +1,8 @@
-"""Processor files of strangers.
+"""Restricts the processor steps that an untrusted processor file can load.
 
-LeRobot (0.6.1) imports what a `policy_preprocessor.json` names as the class of a step and calls it with the options
-there, before it checks that it is a step: `subprocess.Popen` will do. Some of its registered steps load code from the
-Hub as well.
+LeRobot (0.6.1) imports the class of each step that a `policy_preprocessor.json` names and calls it with the options of
+the file before it checks that the class is a step. A malicious file can name `subprocess.Popen`. Some of LeRobot's
+registered steps also load code from the Hub.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ HUB_OPTIONS = ("force_download", "proxies", "token", "cache_dir", "local_files_o
 
 
 def check_processor_files(config: SymviewConfig, model: str, options: dict[str, Any]) -> None:
-    """Check that the files beside a policy name no steps but the policy's own.
+    """Check that the processor files of a policy name only the steps of the policy's own pipelines.
 
     Args:
-        config: of the policy.
-        model: folder or name on the Hub.
-        options: of the download.
+        config: the policy's configuration.
+        model: the policy's folder, or its repository on the Hub.
+        options: options of the download from the Hub.
 
     Raises:
-        ValueError: if they do.
+        ValueError: if a file names another step, or a state file outside its folder.
     """
     from lerobot_policy_symview.processor_pipelines import make_processors
 
@@ -40,14 +40,16 @@ def check_processor_files(config: SymviewConfig, model: str, options: dict[str, 
         file = _file(model, f"{name}.json", options)
         if file is None:
             continue
-        known = [step["registry_name"] for step in pipeline.get_config()["steps"]]
+        allowed = [step["registry_name"] for step in pipeline.get_config()["steps"]]
         for step in json.loads(file.read_text())["steps"]:
-            asked = step.get("registry_name", step.get("class"))
-            if asked not in known or "registry_name" not in step:
-                raise ValueError(f"{file} asks for the step {asked!r}, expected {', '.join(known)}")
+            step_name = step.get("registry_name", step.get("class"))
+            if step_name not in allowed or "registry_name" not in step:
+                raise ValueError(
+                    f"{file} names the processor step {step_name!r}, expected one of: {', '.join(allowed)}"
+                )
             state = step.get("state_file", "")
             if Path(state).name != state:
-                raise ValueError(f"{file}: the state_file of {asked} must lie beside it, got {state!r}")
+                raise ValueError(f"{file}: the state_file of {step_name} must be in the same folder, got {state!r}")
 
 
 def _file(model: str, name: str, options: dict[str, Any]) -> Path | None:
@@ -60,23 +62,26 @@ def _file(model: str, name: str, options: dict[str, Any]) -> Path | None:
         return None
 
 
-def import_no_steps() -> None:
-    """Let LeRobot make steps of processor files only of classes that are steps and were imported by somebody else."""
+def restrict_processor_steps() -> None:
+    """Make LeRobot load processor steps only by registry name or from step classes that are already imported.
+
+    It replaces LeRobot's `DataProcessorPipeline._resolve_step_class`, which would import any class or function.
+    """
     resolve = DataProcessorPipeline._resolve_step_class
 
     def resolve_imported(step_entry: dict[str, Any]) -> tuple[type[ProcessorStep], str]:
         if "registry_name" in step_entry:
             return resolve(step_entry)
         path = step_entry["class"]
-        for kind in _kinds(ProcessorStep):
-            if f"{kind.__module__}.{kind.__qualname__}" == path:
-                return kind, kind.__name__
-        raise ImportError(f"a processor file names {path!r}, which is no step that is registered or was imported")
+        for step_class in _subclasses(ProcessorStep):
+            if f"{step_class.__module__}.{step_class.__qualname__}" == path:
+                return step_class, step_class.__name__
+        raise ImportError(f"a processor file names {path!r}, expected a registered or already imported processor step")
 
     DataProcessorPipeline._resolve_step_class = staticmethod(resolve_imported)
 
 
-def _kinds(kind: type[ProcessorStep]) -> Iterator[type[ProcessorStep]]:
-    yield kind
-    for one in kind.__subclasses__():
-        yield from _kinds(one)
+def _subclasses(step_class: type[ProcessorStep]) -> Iterator[type[ProcessorStep]]:
+    yield step_class
+    for subclass in step_class.__subclasses__():
+        yield from _subclasses(subclass)

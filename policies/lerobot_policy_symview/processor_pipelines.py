@@ -1,4 +1,4 @@
-"""Pre- and postprocessing pipelines of the policies."""
+"""Preprocessing and postprocessing pipelines of the policies."""
 
 from __future__ import annotations
 
@@ -20,17 +20,20 @@ def make_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's default pipelines, with depth in metres and the policy's view where an observation lacks it.
+    """Return LeRobot's default preprocessor and postprocessor with one step added: depth in metres, and the views.
+
+    The added step converts depth to metres and renders the policy's view if an observation lacks it.
 
     Args:
-        config: the policy's.
-        dataset_stats: of LeRobot's normaliser.
-        depth_units: feature -> unit of float depth; by default what LeRobot's loader delivers of the dataset in use.
+        config: the policy's configuration.
+        dataset_stats: dataset statistics for LeRobot's normaliser.
+        depth_units: feature -> unit of float depth; by default the units in which LeRobot's loader delivers the depth
+            features of the training dataset.
 
     Raises:
         ValueError: if the view uses the gripper's pose and the declared state lacks it.
     """
-    meta = getattr(config, "_runtime_dataset_meta", None)  # LeRobot sets it before it makes the processors
+    meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the processors
     if depth_units is None:
         depth_units = delivered_units(meta) if meta is not None else {}
     steps = make_default_policy_processor_steps(config, dataset_stats)

@@ -1,4 +1,4 @@
-"""Every page of the documentation runs as written, with smaller numbers."""
+"""Every page of the documentation runs as written, at a smaller scale."""
 
 import shutil
 from pathlib import Path
@@ -22,13 +22,13 @@ PROSE = ("index.md", "reference.md")  # lists of other pages
 
 
 def real_dataset(folder: Path) -> None:
-    """Record a dataset like a robot's own: a camera and joints, without calibration and gripper pose."""
+    """Record a dataset as from a real robot: a camera and joints, without calibration and gripper pose."""
     pose = (0, 0.70711, -0.70711, 1.02, 1, 0, 0, 0, 0, -0.70711, -0.70711, 0.57, 0, 0, 0, 1)
     camera = CameraSpec("front", 480, 640, intrinsics=(615.3, 0, 319.5, 0, 615.1, 239.5, 0, 0, 1), world_from_cam=pose)
     env = RecordedEnv(camera=camera, oracle=False)
     whole = generate(GenerateConfig(NewDataset("test/whole", folder.with_name("whole")), env, num_episodes=1))
-    unknown = [keys.intrinsics("front"), keys.world_from_cam("front")]
-    remove_feature(LeRobotDataset("test/whole", root=whole), unknown, folder, "test/real")
+    calibration_keys = [keys.intrinsics("front"), keys.world_from_cam("front")]
+    remove_feature(LeRobotDataset("test/whole", root=whole), calibration_keys, folder, "test/real")
     joints = [f"joint_{number}" for number in range(5)]
     change_feature(folder, keys.STATE, names=joints)
     calibration = (block.text for block in blocks(ROOT / "docs" / "own_camera.md") if block.language == "yaml")
@@ -57,6 +57,6 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
 @pytest.mark.parametrize(
     "reader", [README, *(page for page in PAGES if page.name not in PROSE)], indirect=True, ids=lambda page: page.stem
 )
-def test_a_page_runs(reader):
+def test_page_runs(reader):
     page, page_reader = reader
     assert page_reader.follow(page) > 0

@@ -35,8 +35,8 @@ class SilentHandler(SimpleHTTPRequestHandler):
 def site():
     """Folder of the built pages."""
     command = [Path(sys.executable).with_name("zensical"), "build", "--clean", "--strict"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
     return ROOT / "outputs" / "site"
 
 
@@ -59,7 +59,7 @@ def tab():
         window.close()
 
 
-def test_the_site_has_every_page_and_every_public_name(site):
+def test_site_has_every_page_and_public_name(site):
     assert {page.stem for page in PAGES} <= {file.stem for file in site.glob("*.html")}
     reference = (site / "reference.html").read_text()
     for name in (
@@ -98,7 +98,7 @@ def test_every_page_loads_without_errors(site, address, tab):
         assert [anchor for anchor in anchors - {""} if f'id="{anchor}"' not in text] == [], path
 
 
-def test_the_search_finds_a_function(address, tab):
+def test_search_finds_a_function(address, tab):
     tab.goto(f"{address}/index.html", wait_until="networkidle")
     tab.keyboard.press("/")
     tab.keyboard.type("homography")

@@ -1,4 +1,4 @@
-"""Tables and numbers in docs/views.md."""
+"""The tables and numbers in docs/views.md match the code."""
 
 import re
 from dataclasses import fields
@@ -18,7 +18,7 @@ def test_every_view_option_is_listed_with_its_default(view):
         assert re.search(rf"^\| `{option.name}` \| `?{re.escape(default)}`? \|", page, re.MULTILINE), option.name
 
 
-def test_the_clipping_height_matches_the_page():
+def test_clipping_height_matches_the_page():
     heights = np.array([0.0, 0.05, 0.07, 0.2])
     assert [ReprojectedView().ceiling(z) for z in heights] == np.maximum(heights - 0.01, 0.06).tolist()
     assert [ReprojectedView(clip_margin=0, clip_floor=0).ceiling(z) for z in heights] == heights.tolist()

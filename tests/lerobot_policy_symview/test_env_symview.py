@@ -11,7 +11,7 @@ from symview_sim.settings import EnvSettings
 SMALL = CameraSpec(height=32, width=48)
 
 
-def test_the_declared_features_are_those_of_a_recording(recorded):
+def test_declared_features_match_a_recording(recorded):
     declared = SymviewEnvConfig(oracle=True).features
     stored = LeRobotDataset("test/recorded", root=recorded).meta.features
     for key, feature in declared.items():
@@ -29,7 +29,7 @@ def test_the_declared_features_are_those_of_a_recording(recorded):
     ],
     ids=str,
 )
-def test_observations_are_what_is_declared(options):
+def test_observations_match_the_declared_features(options):
     config = SymviewEnvConfig(camera=SMALL, **options)
     env = config.create_envs(1)["block_picking"][0]
     observation, _ = env.reset(seed=0)
@@ -41,7 +41,7 @@ def test_observations_are_what_is_declared(options):
     env.close()
 
 
-def test_views_are_added_before_the_policy_sees_an_observation():
+def test_preprocessor_adds_the_views():
     config = SymviewEnvConfig(camera=SMALL, views=["reproj", "persp"], view_size=40)
     env = config.create_envs(1)["block_picking"][0]
     processor, _ = config.get_env_processors()
@@ -53,12 +53,12 @@ def test_views_are_added_before_the_policy_sees_an_observation():
     env.close()
 
 
-def test_a_view_that_needs_depth_is_refused_without_it():
+def test_view_that_needs_depth_raises_without_depth():
     with pytest.raises(ValueError, match="'reproj' needs depth"):
         SymviewEnvConfig(depth=False, views=["reproj"])
 
 
-def test_all_tasks_or_a_list_are_one_suite():
+def test_all_tasks_or_a_list_form_a_suite():
     suite = SymviewEnvConfig(task="all", camera=SMALL).create_envs(2)
     assert set(suite) == set(TASK_NAMES)
     assert {env.num_envs for group in suite.values() for env in group.values()} == {2}
@@ -68,21 +68,24 @@ def test_all_tasks_or_a_list_are_one_suite():
         SymviewEnvConfig(task="block_picking, drawer_open").create_envs(1)
 
 
-def test_environments_in_processes_of_their_own_see_the_same_and_freeze_when_done():
+def test_asynchronous_environments_match_synchronous_ones_and_freeze_when_done():
     config = SymviewEnvConfig(camera=SMALL)
     asynchronous = config.create_envs(2, use_async_envs=True)["block_picking"][0]
-    expected = [EnvSettings("block_picking", camera=SMALL).make() for _ in range(2)]
-    seen, _ = asynchronous.reset(seed=[5, 6])
-    shown = [env.reset(seed=seed)[0] for env, seed in zip(expected, (5, 6), strict=True)]
+    references = [EnvSettings("block_picking", camera=SMALL).make() for _ in range(2)]
+    observations, _ = asynchronous.reset(seed=[5, 6])
+    expected_observations = [env.reset(seed=seed)[0] for env, seed in zip(references, (5, 6), strict=True)]
     still = np.array([0, 0, 0, 0, 1], dtype=np.float32)
     for step in range(9):  # the first succeeds after seven, the second does not move
         for i in range(2):
-            np.testing.assert_array_equal(seen["pixels"]["side"][i], shown[i]["pixels"]["side"])
-            np.testing.assert_array_equal(seen["agent_pos"][i], shown[i]["agent_pos"])
+            np.testing.assert_array_equal(observations["pixels"]["side"][i], expected_observations[i]["pixels"]["side"])
+            np.testing.assert_array_equal(observations["agent_pos"][i], expected_observations[i]["agent_pos"])
         done = step >= 7
-        action = still if done else expected[0].expert_action()
-        seen, reward, terminated, _, _ = asynchronous.step(np.stack([action, still]))
-        shown = [shown[0] if done else expected[0].step(action)[0], expected[1].step(still)[0]]
+        action = still if done else references[0].expert_action()
+        observations, reward, terminated, _, _ = asynchronous.step(np.stack([action, still]))
+        expected_observations = [
+            expected_observations[0] if done else references[0].step(action)[0],
+            references[1].step(still)[0],
+        ]
         assert reward.tolist() == [float(step == 6), 0.0]
         assert not terminated[1]
     asynchronous.close()

@@ -1,4 +1,4 @@
-"""Every method's policy, from raw observation to the action sent to the robot."""
+"""The equivariance of every method's policy, from the raw observation to the action sent to the robot."""
 
 import pytest
 import torch
@@ -45,8 +45,8 @@ def test_methods_are_equivariant_before_and_after_training_and_loading(method, t
 
 
 @pytest.mark.parametrize("method", EQUIVARIANT)
-def test_the_training_loss_is_invariant(method):
-    """In training mode, where nothing is random: the crop leaves no choice, the points are drawn alike."""
+def test_training_loss_is_invariant(method):
+    """In training mode without randomness: images have the crop's size, and points are sampled with the same seed."""
     policy = make_policy(method=method).double().train()
     config = policy.config
     batch = {key: value.double() for key, value in training_batch(config).items()}
@@ -54,20 +54,20 @@ def test_the_training_loss_is_invariant(method):
         batch |= {key: image[..., :64, :64] for key, image in batch.items() if image.ndim == 4}
     group = checked_group(config)
 
-    def losses(seen):
+    def losses(observation):
         torch.manual_seed(0)
-        return policy.forward(seen, reduction="none")[0]
+        return policy.forward(observation, reduction="none")[0]
 
     expected = losses(dict(batch))
     for element in range(1, group.size):
-        motion = PlanarTransform.of_element(group, element, batch[keys.ACTION])
-        moved = transform_observation(batch, config, group, element)
-        moved[keys.ACTION] = config.actions.transform(batch[keys.ACTION], motion, absolute_yaw=False)
-        torch.testing.assert_close(losses(moved), expected, rtol=1e-10, atol=1e-12)
+        transform = PlanarTransform.of_element(group, element, batch[keys.ACTION])
+        transformed = transform_observation(batch, config, group, element)
+        transformed[keys.ACTION] = config.actions.transform(batch[keys.ACTION], transform, absolute_yaw=False)
+        torch.testing.assert_close(losses(transformed), expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", NONEQUIVARIANT)
-def test_the_plain_network_is_not_equivariant(method):
+def test_plain_network_is_not_equivariant(method):
     policy = make_policy(method=method)
     take_training_steps(policy)
     assert min(equivariance_errors(policy).values()) > 0.05
@@ -76,7 +76,7 @@ def test_the_plain_network_is_not_equivariant(method):
 
 
 @pytest.mark.parametrize("method", RELAXED)
-def test_relaxed_networks_are_equivariant_until_training_relaxes_them(method):
+def test_relaxed_networks_are_equivariant_only_before_training(method):
     policy = make_policy(method=method)
     assert_equivariant(policy)
     take_training_steps(policy, count=20)
@@ -84,19 +84,19 @@ def test_relaxed_networks_are_equivariant_until_training_relaxes_them(method):
 
 
 @pytest.mark.parametrize("method", BROKEN)
-def test_the_direction_to_the_camera_breaks_the_symmetry_unless_the_camera_moves_along(method):
+def test_camera_direction_breaks_the_symmetry_unless_the_camera_moves_with_the_scene(method):
     policy = make_policy(method=method)
     take_training_steps(policy)
     assert_equivariant(policy, camera="moves")
     with pytest.raises(AssertionError, match="not equivariant"):
         assert_equivariant(policy)
     errors = equivariance_errors(policy)
-    assert errors[4] < 1e-4  # the camera stands in the mirror's plane y = 0
+    assert errors[4] < 1e-4  # the camera lies in the reflection's plane y = 0
     assert min(error for element, error in errors.items() if element != 4) > 0.01
 
 
 @pytest.mark.parametrize("group", ["C4", "D8", "C8"])
-def test_other_groups_are_exact_where_pixels_fall_on_pixels(group):
+def test_other_groups_are_exact_for_elements_that_map_pixels_onto_pixels(group):
     policy = make_policy(group=group)
     take_training_steps(policy)
     assert_equivariant(policy)
@@ -105,7 +105,7 @@ def test_other_groups_are_exact_where_pixels_fall_on_pixels(group):
     assert all(error > 1e-3 for element, error in errors.items() if group != "C4" and element % 2)
 
 
-def test_reduced_precision_is_equivariant_as_far_as_it_is_precise():
+def test_bfloat16_autocast_is_equivariant_within_its_precision():
     policy = make_policy()
     take_training_steps(policy)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -116,7 +116,7 @@ def test_reduced_precision_is_equivariant_as_far_as_it_is_precise():
 @pytest.mark.parametrize(
     "method", [method for method in EQUIVARIANT if method not in ("voxel_equi", "point_cloud_equi")]
 )
-def test_policies_that_compute_in_bfloat16_are_held_to_its_precision(method):
+def test_bfloat16_policies_are_equivariant_within_its_precision(method):
     policy, exact = make_policy(method=method, dtype="bfloat16"), make_policy(method=method)
     raw = example_observation(policy.config)
     difference = policy.select_action(dict(raw)) - exact.select_action(dict(raw))
@@ -124,7 +124,7 @@ def test_policies_that_compute_in_bfloat16_are_held_to_its_precision(method):
     assert_equivariant(policy)
 
 
-def test_scaling_x_and_y_apart_breaks_equivariance():
+def test_different_scales_of_x_and_y_break_equivariance():
     policy = make_policy()
     policy.action_width[0] *= 2
     with pytest.raises(AssertionError, match="rotated by 90 degrees"):
@@ -132,8 +132,8 @@ def test_scaling_x_and_y_apart_breaks_equivariance():
 
 
 @pytest.mark.parametrize("mode", [NormalizationMode.MEAN_STD, NormalizationMode.MIN_MAX])
-def test_lerobots_own_normalisation_of_actions_breaks_equivariance(mode):
-    """Every entry by its own statistics: what the policy's configuration keeps LeRobot from doing."""
+def test_lerobots_normalisation_of_actions_breaks_equivariance(mode):
+    """LeRobot scales every dimension by its own statistics; the policy's configuration disables that."""
     policy = make_policy()
     policy.config.normalization_mapping["ACTION"] = mode
     scale = torch.tensor([0.03, 0.02, 0.03, 0.4, 0.5])
@@ -142,14 +142,14 @@ def test_lerobots_own_normalisation_of_actions_breaks_equivariance(mode):
         assert_equivariant(policy, make_symview_bc_pre_post_processors(policy.config, stats))
 
 
-def test_the_papers_text_turns_yaw_the_wrong_way_in_a_mirror():
+def test_trivial_theta_has_the_wrong_yaw_under_reflection():
     errors = equivariance_errors(make_policy(theta_representation="trivial"))
     assert max(errors[element] for element in (1, 2, 3)) < 1e-4
     assert min(errors[element] for element in (4, 5, 6, 7)) > 0.5
 
 
 def test_another_robot_needs_only_another_declaration():
-    """Seven entries in another order, with a rotation vector; the state has no gripper pose of ours."""
+    """Seven dimensions in another order, with a rotation vector; the state lacks the gripper's pose."""
     policy = make_policy(
         action_symmetry=["aperture", "ry", "yaw", "y", "z", "x", "rx"],
         state_symmetry=["scalar", "y:wrist", "x:wrist", "z", "sign"],
@@ -178,7 +178,7 @@ def test_another_robot_needs_only_another_declaration():
         (["x", "y", "z", "yaw", "aperture", "yaw:r"], "image"),
     ],
 )
-def test_every_orientation_in_the_state_turns_along(state, gripper_input):
+def test_every_orientation_in_the_state_rotates_with_the_scene(state, gripper_input):
     options = {"view": ViewSpec("reproj", {"clip": "none"}), "gripper_input": gripper_input}
     policy = make_policy(state_symmetry=state, **options)
     take_training_steps(policy)
@@ -187,7 +187,7 @@ def test_every_orientation_in_the_state_turns_along(state, gripper_input):
 
 @pytest.fixture(scope="module")
 def raw():
-    """What a simulator delivers, without views."""
+    """A batch of one simulated observation, without views."""
     env = EnvSettings("block_picking").make()
     observation, _ = env.reset(seed=3)
     env.close()
@@ -198,9 +198,9 @@ def raw():
     return preprocess_observation(batched)
 
 
-# a mirror image changes which of equally high points a reprojected pixel shows, infill what lies between them
+# a reflection changes which of equally high points a reprojected pixel shows; infill changes the pixels between points
 @pytest.mark.parametrize(
-    ("method", "options", "turned", "mirrored"),
+    ("method", "options", "rotated_tolerance", "reflected_tolerance"),
     [
         ("persp_equi", {"size": 76}, 1e-4, 1e-4),
         ("voxel_equi", {}, 1e-4, 1e-4),
@@ -208,17 +208,18 @@ def raw():
         ("reproj_equi", {"size": 76, "infill": "nearest"}, 0.2, 0.2),
     ],
 )
-def test_policies_turn_from_the_raw_image_on(raw, method, options, turned, mirrored):
+def test_policies_are_equivariant_from_the_raw_image(raw, method, options, rotated_tolerance, reflected_tolerance):
     view = ViewSpec(METHODS[method]["view"], options)
     policy = make_policy(method=method, view=view)
     take_training_steps(policy)
     errors = equivariance_errors(policy, observation=raw)
-    assert max(errors[element] for element in (1, 2, 3)) < turned
-    assert max(errors[element] for element in (4, 5, 6, 7)) < mirrored
-    assert max(equivariance_errors(policy, observation=raw, camera="stays").values()) > max(turned, mirrored)
+    assert max(errors[element] for element in (1, 2, 3)) < rotated_tolerance
+    assert max(errors[element] for element in (4, 5, 6, 7)) < reflected_tolerance
+    fixed_camera_errors = equivariance_errors(policy, observation=raw, camera="stays")
+    assert max(fixed_camera_errors.values()) > max(rotated_tolerance, reflected_tolerance)
 
 
-def test_an_observation_is_moved_and_moved_back():
+def test_inverse_transform_restores_the_observation():
     config = make_config(method="reproj_equi_broken")
     group = checked_group(config)
     raw = example_observation(config, torch.float64)
@@ -232,5 +233,5 @@ def test_an_observation_is_moved_and_moved_back():
             torch.testing.assert_close(difference, torch.zeros_like(difference))
 
 
-def test_methods_are_held_to_the_group_they_are_built_for():
+def test_the_plain_method_is_checked_on_d4():
     assert checked_group(SymviewBcConfig(device="cpu", method="sideview_nonequi")).size == 8

@@ -1,4 +1,4 @@
-"""What the behaviour-cloning policy computes from what; `test_equivariance` has its symmetry."""
+"""The behaviour-cloning policy: inputs, losses, configuration; `test_equivariance` tests its symmetry."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def act(policy, observation, processors=None):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_learns_one_batch(method):
+def test_training_reduces_the_loss_of_every_method(method):
     losses = take_training_steps(make_policy(method=method), count=15, rate=3e-4)
     assert min(losses[-5:]) < 0.9 * losses[0]
 
@@ -42,12 +42,12 @@ def test_every_method_learns_one_batch(method):
     ],
     ids=str,
 )
-def test_every_option_trains(options):
+def test_training_works_with_every_option(options):
     losses = take_training_steps(make_policy(**options), count=3)
     assert all(0 < loss < 10 for loss in losses)
 
 
-def test_points_are_learned_from_where_no_gripper_height_limits_them():
+def test_point_clouds_train_without_the_grippers_height():
     losses = take_training_steps(make_policy(method="point_cloud_equi", state_symmetry=["scalar", "sign"]), count=6)
     assert losses[-1] < losses[0] / 2
 
@@ -55,8 +55,8 @@ def test_points_are_learned_from_where_no_gripper_height_limits_them():
 @pytest.mark.parametrize(
     "method", ["reproj_equi", "sideview_nonequi", "voxel_equi", "point_cloud_equi", "reproj_equi_relaxed"]
 )
-def test_training_is_the_same_to_the_last_bit(method):
-    """Whichever of several threads is faster, which changes from run to run."""
+def test_training_is_bit_identical(method):
+    """With several threads, whose order of completion differs from run to run."""
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     runs = []
@@ -69,7 +69,7 @@ def test_training_is_the_same_to_the_last_bit(method):
         assert all(torch.equal(run[name], value) for run in runs[1:]), name
 
 
-def test_saved_and_loaded_policies_act_alike(tmp_path):
+def test_saved_and_loaded_policies_give_the_same_action(tmp_path):
     policy = make_policy(weight_averaging=0.9)
     take_training_steps(policy)
     expected = act(policy, example_observation(policy.config))
@@ -82,7 +82,7 @@ def test_saved_and_loaded_policies_act_alike(tmp_path):
     torch.testing.assert_close(actual, expected, rtol=1e-6, atol=1e-7)
 
 
-def test_averaged_weights_follow_the_trained_ones_and_act():
+def test_averaged_weights_follow_the_trained_ones_and_give_the_action():
     policy = make_policy(weight_averaging=0.75)
     before = [parameter.clone() for parameter in policy.averaged.parameters()]
     take_training_steps(policy, count=1)
@@ -95,7 +95,7 @@ def test_averaged_weights_follow_the_trained_ones_and_act():
     torch.testing.assert_close(act(policy, example_observation(policy.config)), expected)
 
 
-def test_an_average_that_a_checkpoint_lacks_begins_at_its_weights(tmp_path):
+def test_missing_averaged_weights_are_initialised_with_the_trained_ones(tmp_path):
     policy = make_policy()
     expected = act(policy, example_observation(policy.config))
     policy.save_pretrained(tmp_path)
@@ -112,7 +112,7 @@ def test_millimetres_and_metres_give_the_same_action():
     torch.testing.assert_close(act(policy, in_millimetres), act(policy, raw))
 
 
-def test_a_cameras_own_depth_keeps_its_unit_whatever_one_pixel_says():
+def test_one_far_pixel_does_not_change_the_unit_of_depth():
     policy = make_policy(method="sideview_nonequi")
     key = policy.config.height_key
     raw = example_observation(policy.config)
@@ -120,13 +120,13 @@ def test_a_cameras_own_depth_keeps_its_unit_whatever_one_pixel_says():
     torch.testing.assert_close(act(policy, raw | {key: raw[key] * 1000}), act(policy, raw))
 
 
-def test_the_action_scale_is_shared_by_x_and_y():
+def test_x_and_y_share_an_action_scale():
     policy = make_policy()
     torch.testing.assert_close(policy.action_width, torch.tensor([0.05, 0.05, 0.05, 0.7, 0.5]))
     torch.testing.assert_close(policy.action_center, torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
 
 
-def test_losses_can_be_weighed_sample_by_sample():
+def test_losses_are_available_per_sample():
     policy = make_policy(method="reproj_equi_relaxed").eval()
     batch = training_batch(policy.config)
     each, _ = policy.forward(dict(batch), reduction="none")
@@ -136,7 +136,7 @@ def test_losses_can_be_weighed_sample_by_sample():
     assert output == {"asymmetry": 0.0}
 
 
-def test_noise_in_training_reaches_the_aperture_and_nothing_else(monkeypatch):
+def test_training_noise_changes_only_the_aperture(monkeypatch):
     states = []
     original = SymviewBcPolicy.training_input
     monkeypatch.setattr(
@@ -155,17 +155,17 @@ def test_noise_in_training_reaches_the_aperture_and_nothing_else(monkeypatch):
 
 
 @pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf")])
-def test_impossible_noise_is_refused(noise):
+def test_invalid_noise_raises(noise):
     with pytest.raises(ValueError, match="aperture_noise must be finite and at least 0"):
         make_config(aperture_noise=noise)
 
 
-def test_noise_on_an_aperture_that_is_not_there_is_refused():
+def test_noise_without_an_aperture_raises():
     with pytest.raises(ValueError, match="needs a dimension `aperture` in --policy"):
         make_config(aperture_noise=0.1, state_symmetry=["x", "y", "z"], gripper_input="vector")
 
 
-TRAINED = {
+PARAMETER_COUNTS = {
     "reproj_equi": 1_113_098,
     "persp_equi": 1_113_050,
     "sideview_equi": 1_113_242,
@@ -181,12 +181,13 @@ TRAINED = {
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_policies_train_as_many_numbers_as_they_did(method):
-    """With the heads and the inputs that they are shipped with."""
-    assert SymviewBcPolicy(make_config(method=method, width=64, crop_size=128)).parameter_count == TRAINED[method]
+def test_parameter_counts_of_policies_are_unchanged(method):
+    """With the default heads and inputs."""
+    policy = SymviewBcPolicy(make_config(method=method, width=64, crop_size=128))
+    assert policy.parameter_count == PARAMETER_COUNTS[method]
 
 
-PARAMETERS = {
+ENCODER_PARAMETER_COUNTS = {
     "reproj_equi": 1_112_680,
     "sideview_nonequi": 1_130_560,
     "reproj_equi_relaxed": 1_668_888,
@@ -195,11 +196,11 @@ PARAMETERS = {
 }
 
 
-@pytest.mark.parametrize(("method", "parameters"), PARAMETERS.items())
+@pytest.mark.parametrize(("method", "parameters"), ENCODER_PARAMETER_COUNTS.items())
 def test_encoders_have_the_papers_parameter_counts(method, parameters):
-    """For the paper's five channels; the voxel and point-cloud encoders get no state here beside colour and place."""
-    lifted = method in ("voxel_equi", "point_cloud_equi")
-    options = {"state_symmetry": [], "gripper_input": "vector"} if lifted else {"gripper_input": "none"}
+    """For the paper's five channels; here the voxel and point-cloud encoders get no state."""
+    has_point_input = method in ("voxel_equi", "point_cloud_equi")
+    options = {"state_symmetry": [], "gripper_input": "vector"} if has_point_input else {"gripper_input": "none"}
     config = make_config(method=method, width=64, crop_size=128, **options)
     policy = SymviewBcPolicy(config)
     assert sum(parameter.numel() for parameter in policy.network.encoder.parameters()) == parameters
@@ -239,13 +240,13 @@ def test_the_head_has_the_papers_parameter_count():
         ({"state_symmetry": ["x", "y", "z"]}, "lacks .'yaw', 'aperture'.: use --policy.gripper_input=vector"),
     ],
 )
-def test_impossible_configurations_are_refused_by_their_flag(options, message):
+def test_invalid_configuration_errors_name_the_flag(options, message):
     with pytest.raises(ValueError, match=message):
         SymviewBcConfig(device="cpu", **options)
 
 
 @pytest.mark.parametrize("shape", [(60, 152), (152, 60)])
-def test_images_must_be_as_large_as_the_crop_both_ways(shape):
+def test_images_must_be_as_large_as_the_crop_in_both_dimensions(shape):
     config = SymviewBcConfig(device="cpu", method="sideview_equi", modality="rgb", crop_size=64)
     numbers = {"dtype": "float32", "shape": (5,), "names": None}
     image = {"dtype": "image", "shape": (*shape, 3), "names": None}
@@ -253,7 +254,7 @@ def test_images_must_be_as_large_as_the_crop_both_ways(shape):
         config.set_dataset_feature_metadata({keys.STATE: numbers, keys.ACTION: numbers, keys.rgb("side"): image})
 
 
-def test_reduced_precision_acts_nearly_alike():
+def test_bfloat16_changes_actions_only_slightly():
     policy = make_policy()
     expected = act(policy, example_observation(policy.config))
     policy.config.dtype = "bfloat16"
@@ -263,7 +264,7 @@ def test_reduced_precision_acts_nearly_alike():
 
 
 @pytest.mark.parametrize("method", ["voxel_equi", "reproj_equi_broken"])
-def test_the_camera_may_be_stated_in_place_of_observed(method):
+def test_configured_calibration_replaces_the_observations(method):
     policy = make_policy(method=method)
     raw = example_observation(policy.config)
     expected = act(policy, raw)
@@ -276,21 +277,21 @@ def test_the_camera_may_be_stated_in_place_of_observed(method):
         "intrinsics": k.view(3, 3).tolist(),
         "world_from_cam": pose.view(4, 4).tolist(),
     }
-    told = make_policy(method=method, calibration={"units": "m", "cameras": {"side": side}})
-    torch.testing.assert_close(act(told, raw), expected, rtol=1e-4, atol=1e-6)
+    calibrated = make_policy(method=method, calibration={"units": "m", "cameras": {"side": side}})
+    torch.testing.assert_close(act(calibrated, raw), expected, rtol=1e-4, atol=1e-6)
 
 
-def test_a_stated_option_wins_over_the_methods():
+def test_given_options_take_precedence_over_the_methods():
     config = SymviewBcConfig(device="cpu", method="sideview_equi", modality="rgb", encoder="plain")
     assert (config.view.name, config.modality, config.encoder, config.group) == ("side", "rgb", "plain", "C1")
 
 
-def test_a_side_view_is_that_of_the_named_camera():
+def test_side_view_uses_the_named_camera():
     config = SymviewBcConfig(device="cpu", method="sideview_equi", camera="left")
     assert config.raw_keys == [keys.rgb("left"), keys.depth("left")]
 
 
-def test_the_configuration_offers_what_the_networks_have():
+def test_configuration_choices_match_the_networks():
     for encoder in ENCODERS.builtin:
         assert ENCODERS[encoder]
     for crop_size in CROP_SIZES:
@@ -299,7 +300,7 @@ def test_the_configuration_offers_what_the_networks_have():
         assert all(value in CHOICES[name] for name, value in preset.items() if name in CHOICES)
 
 
-def test_a_view_that_is_registered_later_is_a_choice_too():
+def test_registered_views_are_choices():
     with registered(VIEWS, "other", ReprojectedView):
         assert [spec.name for spec in make_config(view="other", modality="rgb").views_to_make] == ["other"]
         with pytest.raises(ValueError, match="did you mean 'other'"):

@@ -27,7 +27,7 @@ REPROJ = {"name": "reproj", "size": VIEW_SIZE}
 
 @pytest.fixture(scope="module")
 def observed():
-    """A batch of one observation, as lerobot-eval hands it to the processors: the first frame of the recording."""
+    """A batch of one observation, as lerobot-eval passes it to the processors: the first frame of the recording."""
     env = EnvSettings("block_picking").make()
     observation, _ = env.reset(seed=episode_seed(0, 0))
     env.close()
@@ -38,7 +38,7 @@ def observed():
     return preprocess_observation(batched)
 
 
-def test_online_and_offline_views_are_the_same_bits(observed, with_views):
+def test_online_and_offline_views_are_bit_identical(observed, with_views):
     online = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
     offline = LeRobotDataset("test/with_views", root=with_views, depth_output_unit="m")[0]
     for name in VIEWS:
@@ -55,22 +55,22 @@ def in_millimetres(depth):
     return np.rint(1000 * depth).astype(np.uint16)
 
 
-def spoilt(depth, values):
-    wrong = depth.copy()
+def with_pixel_values(depth, values):
+    changed = depth.copy()
     for start, value in enumerate(values):
-        wrong.reshape(-1)[start::31] = value
-    return wrong
+        changed.reshape(-1)[start::31] = value
+    return changed
 
 
 def with_invalid_pixels(depth):
-    return spoilt(depth, [np.nan, -np.inf, 0.0, -0.5])
+    return with_pixel_values(depth, [np.nan, -np.inf, 0.0, -0.5])
 
 
 def with_far_pixels(depth):
-    return spoilt(depth, [np.inf, 12.0])
+    return with_pixel_values(depth, [np.inf, 12.0])
 
 
-@pytest.mark.parametrize("sensed", [in_metres, in_millimetres, with_invalid_pixels, with_far_pixels])
+@pytest.mark.parametrize("convert_depth", [in_metres, in_millimetres, with_invalid_pixels, with_far_pixels])
 @pytest.mark.parametrize(
     ("name", "options"),
     [
@@ -81,11 +81,11 @@ def with_far_pixels(depth):
         ("persp", {"plane_height": 0.03, "gripper": False}),
     ],
 )
-def test_with_any_options_and_depth_the_step_gives_the_bits_of_the_view(observed, name, options, sensed):
+def test_step_and_view_are_bit_identical_for_all_options_and_depths(observed, name, options, convert_depth):
     view = make_view(name, size=VIEW_SIZE, **options)
     matrices = (observed[key("side")][0].numpy() for key in (keys.intrinsics, keys.world_from_cam))
     rgb = (observed[keys.rgb("side")][0] * 255).round().byte().permute(1, 2, 0).numpy()
-    depth = sensed(observed[keys.depth("side")][0, 0].numpy())
+    depth = convert_depth(observed[keys.depth("side")][0, 0].numpy())
     camera = stored_camera(*matrices, *depth.shape)
     offline = view.render(Frame(rgb, in_metres_offline(depth), camera, Workspace(), observed[keys.STATE][0].numpy()))
     observation = observed | {keys.depth("side"): torch.from_numpy(depth)[None, None]}
@@ -99,7 +99,7 @@ def test_with_any_options_and_depth_the_step_gives_the_bits_of_the_view(observed
         assert made.any()
 
 
-def test_a_view_that_is_present_is_left_alone(observed):
+def test_present_views_are_kept_unchanged(observed):
     step = ViewsProcessorStep(views=["reproj"])
     first = step.observation(dict(observed))
     marked = first | {"observation.images.side_reproj": torch.zeros(1, 3, 4, 4)}
@@ -107,7 +107,7 @@ def test_a_view_that_is_present_is_left_alone(observed):
 
 
 @pytest.mark.parametrize("missing", make_view("reproj").outputs)
-def test_of_a_view_only_what_is_missing_is_added(observed, missing):
+def test_only_missing_outputs_of_a_view_are_added(observed, missing):
     step = ViewsProcessorStep(views=[REPROJ])
     own = step.observation(dict(observed))
     outputs = [keys.view("side", output) for output in make_view("reproj").outputs]
@@ -131,7 +131,7 @@ def test_every_sample_of_a_batch_uses_its_own_calibration(observed):
 
 @pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("square", [False, True])
-def test_calibration_may_be_unbatched_and_square(observed, batch, square):
+def test_calibration_may_be_unbatched_or_square(observed, batch, square):
     """LeRobot adds a batch axis to images and states only."""
     several = {key: torch.cat([value] * batch) for key, value in observed.items()}
     expected = ViewsProcessorStep(views=OPTIONS).observation(dict(several))
@@ -146,7 +146,7 @@ def test_calibration_may_be_unbatched_and_square(observed, batch, square):
                 assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
 
 
-def test_calibration_of_another_shape_is_refused(observed):
+def test_calibration_of_a_wrong_shape_raises(observed):
     wrong = observed | {keys.intrinsics("side"): torch.eye(4)[None]}
     with pytest.raises(
         CalibrationError, match=r"side\.intrinsics has shape \(1, 4, 4\), expected one of \[\(9,\), \(3, 3\)"
@@ -165,20 +165,20 @@ def test_colour_may_be_uint8(observed):
             assert torch.equal(made[keys.view("side", output)], expected[keys.view("side", output)]), output
 
 
-def test_devices_without_float64_leave_the_views_to_the_cpu(observed, monkeypatch):
+def test_views_are_rendered_on_the_cpu_for_devices_without_float64(observed, monkeypatch):
     class Mps(str):
         type = "mps"
 
-    class ElsewhereTensor(torch.Tensor):
-        device = Mps("cpu")  # what torch takes to be the CPU, and our code an Apple GPU
+    class MpsTensor(torch.Tensor):
+        device = Mps("cpu")  # torch treats it as the CPU, our code as an Apple GPU
 
     def refuse(*_):
         raise AssertionError("float64 on an Apple GPU")
 
     monkeypatch.setattr("lerobot_symview.views.torch_backend.render_batch", refuse)
     key = keys.rgb("side")
-    elsewhere = observed | {key: observed[key].as_subclass(ElsewhereTensor)}
-    made, expected = (ViewsProcessorStep(views=OPTIONS).observation(one) for one in (elsewhere, dict(observed)))
+    on_mps = observed | {key: observed[key].as_subclass(MpsTensor)}
+    made, expected = (ViewsProcessorStep(views=OPTIONS).observation(batch) for batch in (on_mps, dict(observed)))
     assert torch.equal(made[keys.view("side", "reproj")], expected[keys.view("side", "reproj")])
 
 
@@ -190,25 +190,25 @@ def test_the_step_is_rebuilt_from_its_configuration(observed):
 
 
 def reordered(observed):
-    """The same moment from a robot whose state has another order, and the declaration of that."""
-    kinds = ["aperture", "yaw", "scalar", "y", "z", "x"]
+    """The same frame with the state's dimensions in another order, and their declaration."""
+    dimensions = ["aperture", "yaw", "scalar", "y", "z", "x"]
     named = dict(zip(keys.STATE_NAMES, observed[keys.STATE][0], strict=True)) | {"scalar": torch.tensor(9.0)}
-    return observed | {keys.STATE: torch.stack([named[kind] for kind in kinds])[None]}, kinds
+    return observed | {keys.STATE: torch.stack([named[label] for label in dimensions])[None]}, dimensions
 
 
 @pytest.mark.parametrize("method", ["reproj_equi", "persp_equi"])
-def test_a_state_of_another_order_gives_the_same_view(observed, method):
-    state, kinds = reordered(observed)
+def test_order_of_the_state_does_not_change_the_view(observed, method):
+    state, dimensions = reordered(observed)
     view = ViewSpec("persp", {"plane_height": "gripper"}) if method == "persp_equi" else ViewSpec("reproj")
     usual = make_config(method=method, view=view)
     expected = make_processors(usual)[0](dict(observed))
-    config = make_config(method=method, view=view, state_symmetry=kinds)
-    seen = make_processors(config)[0](dict(state))
+    config = make_config(method=method, view=view, state_symmetry=dimensions)
+    reordered_view = make_processors(config)[0](dict(state))
     for key in filter(None, (config.color_key, config.height_key if method == "reproj_equi" else None)):
-        assert torch.equal(seen[key], expected[key]), key
+        assert torch.equal(reordered_view[key], expected[key]), key
 
 
-def test_a_view_that_needs_a_gripper_is_refused_where_the_state_has_none(observed):
+def test_view_that_uses_the_gripper_raises_if_the_state_has_none(observed):
     options = {"state_symmetry": ["x", "y", "scalar", "sign", "scalar"], "gripper_input": "vector"}
     with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* lacks \['z', 'yaw', 'aperture'\].*clip: none"):
         make_processors(make_config(**options))
@@ -216,15 +216,15 @@ def test_a_view_that_needs_a_gripper_is_refused_where_the_state_has_none(observe
     assert config.color_key in make_processors(config)[0](dict(observed))
 
 
-def test_simulators_are_refused_where_the_declared_state_is_not_theirs(observed):
-    _, kinds = reordered(observed)
+def test_simulator_raises_if_the_declared_state_is_not_its_own(observed):
+    _, dimensions = reordered(observed)
     assert simulator_config(make_config(), EnvSettings("block_picking")).names
-    kinds.remove("scalar")
+    dimensions.remove("scalar")
     with pytest.raises(ValueError, match=r"--policy.state_symmetry=.* which is \[x, y, z, yaw, aperture\]"):
-        simulator_config(make_config(state_symmetry=kinds), EnvSettings("block_picking"))
+        simulator_config(make_config(state_symmetry=dimensions), EnvSettings("block_picking"))
 
 
-def test_missing_inputs_are_named(observed):
+def test_missing_input_error_names_the_key(observed):
     without = {key: value for key, value in observed.items() if "intrinsics" not in key}
     with pytest.raises(KeyError, match=r"observation\.camera\.side\.intrinsics"):
         ViewsProcessorStep(views=OPTIONS).observation(without)
@@ -240,21 +240,21 @@ def metres(key, values, **units):
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 12.0, -12.0, 0.0])
-def test_a_wrong_pixel_does_not_change_an_inferred_depth_unit(wrong):
+def test_invalid_pixel_does_not_change_the_inferred_depth_unit(wrong):
     depth = torch.tensor([0.0, 0.8, 1.2, wrong])
     torch.testing.assert_close(metres(DEPTH, depth), depth, equal_nan=True)
     torch.testing.assert_close(metres(DEPTH, depth * 1000), depth, equal_nan=True)
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf, 0.0])
-def test_one_height_decides_an_inferred_height_unit(wrong):
+def test_highest_value_decides_the_inferred_height_unit(wrong):
     heights = torch.tensor([0.0, 0.0, 0.0, 0.001, 0.03, wrong])
     torch.testing.assert_close(metres(HEIGHT, heights), heights, equal_nan=True)
     torch.testing.assert_close(metres(HEIGHT, heights * 1000), heights, equal_nan=True)
 
 
 @pytest.mark.parametrize("key", [DEPTH, HEIGHT])
-def test_a_declared_unit_decides_whatever_the_values(key, caplog):
+def test_declared_unit_takes_precedence_over_the_values(key, caplog):
     low = torch.tensor([0.0, 1.0, 9.0])  # millimetres of a nearly bare table
     torch.testing.assert_close(metres(key, low, units={key: "mm"}), low / 1000)
     far = torch.tensor([20.0, 30.0])
@@ -262,7 +262,7 @@ def test_a_declared_unit_decides_whatever_the_values(key, caplog):
     assert not caplog.messages
 
 
-def test_an_inferred_unit_is_logged_once(caplog):
+def test_inferred_unit_is_logged_once(caplog):
     caplog.set_level("INFO")
     step = ViewsProcessorStep()
     for _ in range(2):
@@ -277,7 +277,7 @@ def test_depth_is_converted_once():
 
 
 @pytest.mark.parametrize("output_unit", ["m", "mm"])
-def test_the_unit_that_lerobots_loader_delivers_is_known(with_views, output_unit):
+def test_delivered_units_match_lerobots_loader(with_views, output_unit):
     dataset = LeRobotDataset("test/with_views", root=with_views, depth_output_unit=output_unit)
     units = delivered_units(dataset.meta)
     assert units[DEPTH] == units[HEIGHT] == output_unit
@@ -295,7 +295,7 @@ def test_integers_are_millimetres(key, dtype):
 
 
 @pytest.mark.parametrize("key", [DEPTH, HEIGHT])
-def test_empty_images_have_no_unit(key):
+def test_empty_images_are_accepted(key):
     assert metres(key, torch.zeros(0, 1, 4, 4)).shape == (0, 1, 4, 4)
 
 
@@ -310,7 +310,7 @@ def test_views_of_a_robot_without_gripper_state_are_not_clipped(observed):
 
 
 def test_integer_depth_of_a_camera_is_reprojected(observed):
-    """As `prepare_observation_for_inference` hands over a RealSense's."""
+    """LeRobot's `prepare_observation_for_inference` passes a RealSense's depth as integers."""
     key = keys.depth("side")
     millimetres = (observed[key] * 1000).round()
     step = ViewsProcessorStep(views=[REPROJ])
@@ -326,21 +326,21 @@ def without_calibration(observed):
     return {key: value for key, value in observed.items() if not key.startswith("observation.camera.")}
 
 
-def stated(observed):
+def calibration_of(observed):
     matrices = {"intrinsics": (keys.intrinsics, 3), "world_from_cam": (keys.world_from_cam, 4)}
     side = {name: observed[key("side")][0].reshape(n, n).tolist() for name, (key, n) in matrices.items()}
     return {"units": "m", "cameras": {"side": {"height": 152, "width": 152, **side}}}
 
 
-def test_a_stated_calibration_serves_observations_without_one(observed):
+def test_configured_calibration_is_used_for_observations_without_one(observed):
     own = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
-    step = ViewsProcessorStep(views=OPTIONS, calibration=json.loads(json.dumps(stated(observed))))
+    step = ViewsProcessorStep(views=OPTIONS, calibration=json.loads(json.dumps(calibration_of(observed))))
     for key, image in ViewsProcessorStep(**step.get_config()).observation(without_calibration(observed)).items():
         assert torch.equal(image, own[key]), key
 
 
-def test_an_observations_own_calibration_comes_first(observed):
-    wrong = stated(observed)
+def test_observed_calibration_takes_precedence(observed):
+    wrong = calibration_of(observed)
     wrong["cameras"]["side"]["intrinsics"][0][0] *= 2
     own = ViewsProcessorStep(views=OPTIONS).observation(dict(observed))
     step = ViewsProcessorStep(views=OPTIONS, calibration=wrong)
@@ -349,8 +349,8 @@ def test_an_observations_own_calibration_comes_first(observed):
     assert not torch.equal(step.observation(without_calibration(observed))[key], own[key])
 
 
-def test_images_of_another_size_than_calibrated_are_refused(observed):
-    step = ViewsProcessorStep(views=["persp"], calibration=stated(observed))
+def test_images_of_another_size_than_calibrated_raise(observed):
+    step = ViewsProcessorStep(views=["persp"], calibration=calibration_of(observed))
     small = {key: value[..., ::2, ::2] if "images" in key else value for key, value in observed.items()}
     with pytest.raises(CalibrationError, match="calibrated for 152 x 152 pixels, the observation has 76 x 76"):
         step.observation(without_calibration(small))

@@ -1,4 +1,4 @@
-"""LeRobot's own training command, in this process, for every method; and what it leaves, evaluated."""
+"""LeRobot's training command, in this process, for every method; its checkpoint is loaded and acts."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ from tests.helpers.training import train
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_every_method_is_trained_saved_loaded_and_acts(method, with_views, tmp_path, monkeypatch, capsys):
+def test_every_method_trains_saves_loads_and_acts(method, with_views, tmp_path, monkeypatch, capsys):
     checkpoint = train(monkeypatch, with_views, tmp_path / "policy", f"--policy.method={method}")
     policy = SymviewBcPolicy.from_pretrained(checkpoint)
     assert policy.config.method == method
@@ -33,6 +33,8 @@ def test_every_method_is_trained_saved_loaded_and_acts(method, with_views, tmp_p
     assert torch.isfinite(action).all()
 
 
-def test_a_wrong_declaration_is_refused_before_training(with_views, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match=r"--policy.action_symmetry describes 3 entries.*'action' has 5 \(dx, dy, dz"):
+def test_wrong_declaration_raises_before_training(with_views, tmp_path, monkeypatch):
+    with pytest.raises(
+        ValueError, match=r"--policy.action_symmetry describes 3 dimensions.*'action' has 5 \(dx, dy, dz"
+    ):
         train(monkeypatch, with_views, tmp_path / "policy", "--policy.action_symmetry=[x, y, z]")

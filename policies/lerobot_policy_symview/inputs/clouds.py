@@ -1,4 +1,4 @@
-"""Coloured points in the workspace from batches of RGBD images, on the device where these are."""
+"""Coloured point clouds of the workspace from batches of RGBD images, computed on the images' device."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.workspace import Workspace
 
-POINTS = 1024  # per scene, for the point-cloud encoder
+POINTS = 1024  # points per scene that the point-cloud encoder gets
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of B scenes, P for each pixel of its image.
+    """Point clouds of B scenes, one point for each of the P pixels of an image.
 
     Args:
         position: (B, P, 3) float64 metres; x and y relative to the workspace centre, z above the table.
-        color: (B, P, 3) in [0, 1].
-        valid: (B, P) bool, whether a point was measured and lies in the working volume.
+        color: (B, P, 3) RGB in [0, 1].
+        valid: (B, P) bool, whether the pixel's depth is valid and its point lies in the working volume.
     """
 
     position: Tensor
@@ -33,17 +33,17 @@ class Cloud:
         return replace(self, position=torch.stack([x, y, self.position[..., 2]], dim=-1))
 
     def sample(self, count: int, shuffle: bool) -> Tensor:
-        """Choose `count` valid points per scene: (B, count, 6) float32 of x, y, z and colour.
+        """Sample `count` valid points per scene: (B, count, 6) float32, x, y, z in metres and RGB.
 
-        Without `shuffle` the choice is the same for every image of one size. A scene of fewer points repeats them, one
-        of none has them all at its centre.
+        Without `shuffle` the sampling order is fixed for each image size. A scene with fewer valid points repeats them;
+        a scene without any gives zeros.
         """
         if shuffle:
             rank = torch.rand(self.valid.shape, device=self.valid.device)
         else:
             rank = torch.rand(self.valid.shape[1], generator=torch.Generator().manual_seed(0)).to(self.valid.device)
-        wanted = min(count, self.valid.shape[1])
-        order = torch.where(self.valid, rank, 2.0).topk(wanted, dim=1, largest=False).indices
+        distinct = min(count, self.valid.shape[1])
+        order = torch.where(self.valid, rank, 2.0).topk(distinct, dim=1, largest=False).indices
         available = self.valid.sum(dim=1, keepdim=True).clamp(min=1)
         chosen = order.gather(1, torch.arange(count, device=order.device)[None] % available)
         points = torch.cat([self.position.to(self.color.dtype), self.color], dim=-1)
@@ -54,15 +54,15 @@ class Cloud:
 def cloud_from_depth(
     rgb: Tensor, depth: Tensor, intrinsics: Tensor, world_from_cam: Tensor, workspace: Workspace, ceiling: Tensor
 ) -> Cloud:
-    """Unproject RGBD images (paper Eq. 2 to 4) and keep what lies in the working volume and below a ceiling.
+    """Unproject RGBD images (paper Eq. 2 to 4); points in the working volume and below the ceiling are valid.
 
     Args:
-        rgb: (B, 3, H, W) in [0, 1].
+        rgb: (B, 3, H, W) RGB in [0, 1].
         depth: (B, 1, H, W) metres along the optical axis; 0 and non-finite values are invalid.
         intrinsics: (B, 9) row-major K, pixels.
-        world_from_cam: (B, 16) row-major poses.
+        world_from_cam: (B, 16) row-major camera poses, translation in metres.
         workspace: the working volume.
-        ceiling: (B,) metres above the table, as for reprojection: it leaves out the arm.
+        ceiling: (B,) metres above the table; points above it are invalid, which removes the arm, as in reprojection.
     """
     batch, _, height, width = depth.shape
     distance = depth[:, 0].double()
@@ -78,6 +78,6 @@ def cloud_from_depth(
     valid = (distance > 0) & torch.isfinite(distance)
     valid = valid.flatten(1) & (position[..., :2].abs() < half).all(-1)
     valid &= position[..., 2] < ceiling.double().clamp(max=workspace.height_limit)[:, None]
-    # points left out lie at the centre, so that no infinity reaches a network
+    # invalid points are set to the centre, so that no infinity or NaN reaches a network
     position = torch.where(valid[..., None], position, 0.0)
     return Cloud(position, rgb.flatten(2).transpose(1, 2), valid)

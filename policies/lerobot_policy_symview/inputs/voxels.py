@@ -1,4 +1,4 @@
-"""Occupancy and colour of the working volume on a grid (paper A.4: 64 x 64 x 32 voxels of 0.625 cm)."""
+"""Voxel grids of the working volume: occupancy and colour (paper A.4: 64 x 64 x 32 voxels of 0.625 cm)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ VOXEL_CHANNELS = 4
 
 
 def voxelize(cloud: Cloud, workspace: Workspace) -> Tensor:
-    """Return (B, 4, 32, 64, 64) float32: whether a voxel holds a point, and its points' mean colour; z, x, y last.
+    """Return voxel grids (B, 4, 32, 64, 64) float32: occupancy (0 or 1) and the mean RGB of a voxel's points.
 
-    Voxels are cubes of 1/64 of the workspace's side; the lowest layer is centred on the table.
+    The last three axes are z, x, y. A voxel's edge is 1/64 of the workspace's side; the lowest layer is centred on the
+    table.
     """
     edge = workspace.size / SIDE
     column = torch.floor(cloud.position[..., :2] / edge + SIDE / 2).long()
@@ -26,7 +27,7 @@ def voxelize(cloud: Cloud, workspace: Workspace) -> Tensor:
     batch = torch.arange(len(layer), device=layer.device)[:, None]
     voxel = ((batch * HEIGHT + layer) * SIDE + column[..., 0]) * SIDE + column[..., 1]
     count = len(layer) * HEIGHT * SIDE * SIDE
-    voxel = torch.where(inside, voxel, count)  # one more voxel takes what lies outside
+    voxel = torch.where(inside, voxel, count)  # an extra voxel collects the points outside the grid
     values = torch.cat([torch.ones_like(cloud.color[..., :1]), cloud.color], dim=-1).flatten(0, 1)
     sums = values.new_zeros(count + 1, VOXEL_CHANNELS).index_add_(0, voxel.flatten(), values)[:-1]
     grid = (sums / sums[:, :1].clamp(min=1)).view(len(layer), HEIGHT, SIDE, SIDE, VOXEL_CHANNELS)

@@ -1,6 +1,6 @@
-"""The image encoder as escnn builds and runs it: what ours is held against, and where weights may come from.
+"""The image encoder built with escnn: the reference for tests and the benchmark, and a source of weights.
 
-Needs the escnn package; nothing else here does.
+It imports escnn by `escnn_import`; no other module of the package does.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from lerobot_policy_symview.nn.layers import FieldConv2d
 
 
 class EscnnEncoder(nn.Module):
-    """The D4 image encoder of the same fields as one of ours whose inputs are all scalars.
+    """An escnn encoder with the layers and fields of an `ImageEncoder` on D4 whose inputs are all scalars.
 
     Args:
-        like: whose layout to take.
-        initialize: draw escnn's initialisation, which takes seconds.
+        like: the encoder that gives the layout.
+        initialize: draw escnn's random initialisation, which takes seconds.
     """
 
     def __init__(self, like: ImageEncoder, initialize: bool = True):
@@ -38,19 +38,20 @@ class EscnnEncoder(nn.Module):
             current = out_type
         self.layers = enn.SequentialModule(*layers)
 
-    def forward(self, picture: Tensor, state: Tensor) -> Tensor:
-        """Map pictures (B, C, crop, crop) and scalar states (B, D) to features (B, 8, n), as `ImageEncoder` does."""
-        planes = state[:, :, None, None].expand(-1, -1, *picture.shape[-2:])
-        features = self.layers(enn.GeometricTensor(torch.cat([picture, planes], dim=1), self.in_type)).tensor
+    def forward(self, observation: Tensor, state: Tensor) -> Tensor:
+        """Map images (B, C, crop, crop) and scalar states (B, D) to features (B, 8, n), as `ImageEncoder` does."""
+        planes = state[:, :, None, None].expand(-1, -1, *observation.shape[-2:])
+        features = self.layers(enn.GeometricTensor(torch.cat([observation, planes], dim=1), self.in_type)).tensor
         return features.flatten(1).unflatten(1, (-1, 8)).transpose(1, 2)
 
 
 @torch.no_grad()
 def load_from_escnn(encoder: ImageEncoder, reference: EscnnEncoder) -> None:
-    """Give an encoder the function of a reference of its layout.
+    """Set an encoder's weights so that it computes the same function as an escnn encoder of the same layout.
 
-    escnn's filters are sums of the same functions (`steerable_basis`), so the weights follow from those of the output
-    block of the identity. It keeps a field's eight entries together; we keep an entry's fields together.
+    escnn's filters are linear combinations of the same basis (`steerable_basis`), so the weights follow from the
+    filters of the identity's output block. escnn keeps the eight channels of a field together; `FieldConv2d` keeps the
+    fields' channels of a group element together.
     """
     sources = [layer for layer in reference.layers if isinstance(layer, enn.R2Conv)]
     for layer, source in zip(_convolutions(encoder), sources, strict=True):

@@ -1,7 +1,7 @@
-"""Imports escnn on machines where its optional dependency `lie_learn` does not build.
+"""Imports escnn, also where its dependency `lie_learn` does not build.
 
-escnn 1.0.11 imports `lie_learn` for rotations in three dimensions, of which planar groups use nothing; on Python 3.12
-that package has no working build. Where it is missing, a stand-in is registered that fails when used.
+escnn 1.0.11 imports `lie_learn` for rotations in three dimensions, which planar groups do not use; on Python 3.12 that
+package has no working build. Where it is missing, this module registers a stub that raises an ImportError when called.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import types
 import warnings
 
 
-def _stand_in_for_lie_learn() -> None:
+def _register_lie_learn_stub() -> None:
     if importlib.util.find_spec("lie_learn") is not None:
         return
 
@@ -30,9 +30,9 @@ def _stand_in_for_lie_learn() -> None:
 
 if importlib.util.find_spec("escnn") is None:
     raise ModuleNotFoundError("escnn is not installed; docs/install.md says how to install it", name="escnn")
-_stand_in_for_lie_learn()
+_register_lie_learn_stub()
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # py3nj is missing for the same reason, and as little used
+    warnings.simplefilter("ignore")  # about py3nj, which is missing and unused for the same reasons
     from escnn import gspaces
     from escnn import nn as enn
 

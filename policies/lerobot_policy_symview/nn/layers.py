@@ -48,7 +48,8 @@ def pixel_basis(group: PlanarGroup) -> NDArray[np.float64]:
     """
     if not group.is_exact:
         raise ValueError(
-            f"filters of single pixels cannot be rotated by {360 / group.turns:g} degrees: use a group of quarter turns"
+            f"filters of single pixels cannot be rotated by {360 / group.rotations:g} degrees: "
+            "use a group of quarter turns"
         )
     row, column = np.moveaxis(_transformed_taps(group).round().astype(int) + 1, -1, 0)
     return np.eye(TAPS)[:, 3 * row + column].transpose(1, 0, 2)

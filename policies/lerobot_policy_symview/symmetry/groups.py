@@ -1,4 +1,4 @@
-"""Finite groups of turns and mirrorings of the table, and how they move vectors, angles and each other."""
+"""Finite groups of planar rotations and reflections, their multiplication tables and their representations."""
 
 from __future__ import annotations
 
@@ -12,74 +12,76 @@ from numpy.typing import NDArray
 from lerobot_symview.registry import lookup
 
 GROUP_NAMES = ("D4", "C4", "D8", "C8", "C1")
-DECIMALS = 12  # what is left of cos(90 degrees) after rounding: nothing, in float32 as in float64
+DECIMALS = 12  # rounds cos(90 degrees), 6e-17 in float64, to an exact 0
 
 
 @dataclass(frozen=True)
 class PlanarGroup:
-    """C_N, the turns by multiples of 360 degrees / N, or D_N, which mirrors too.
+    """The cyclic group C_N (rotations by multiples of 360 degrees / N) or the dihedral group D_N (with reflections).
 
-    Element `flip * N + k` mirrors the scene in the plane y = 0 if `flip`, then turns it by k 360 / N degrees about z.
+    Element `reflected * N + k` reflects the scene in the plane y = 0 if `reflected` is 1, then rotates it by
+    k 360 / N degrees about z.
 
     Args:
-        turns: N.
-        mirrors: whether mirror images belong to it.
+        rotations: N, the number of rotations.
+        reflections: whether the group contains reflections.
     """
 
-    turns: int
-    mirrors: bool
+    rotations: int
+    reflections: bool
 
     @property
     def size(self) -> int:
         """Number of elements."""
-        return self.turns * (1 + self.mirrors)
+        return self.rotations * (1 + self.reflections)
 
     @property
     def is_exact(self) -> bool:
         """Whether every element maps the pixels of a square image onto pixels."""
-        return self.turns in (1, 2, 4)
+        return self.rotations in (1, 2, 4)
 
     def angle(self, element: int) -> float:
-        """Angle of the element's turn, radians."""
-        return 2 * np.pi * (element % self.turns) / self.turns
+        """Angle of the element's rotation, radians."""
+        return 2 * np.pi * (element % self.rotations) / self.rotations
 
-    def flips(self, element: int) -> bool:
-        """Whether the element mirrors."""
-        return element >= self.turns
+    def reflects(self, element: int) -> bool:
+        """Whether the element contains the reflection y -> -y."""
+        return element >= self.rotations
 
     @cached_property
     def product(self) -> NDArray[np.int64]:
-        """(G, G): entry [g, h] is the element that does h, then g."""
-        turn, flip = np.arange(self.size) % self.turns, np.arange(self.size) // self.turns
-        sign = 1 - 2 * flip
-        angle = (turn[:, None] + sign[:, None] * turn[None]) % self.turns
-        return (flip[:, None] ^ flip[None]) * self.turns + angle
+        """(G, G): entry [g, h] is the element g h, which applies h first, then g."""
+        rotation, reflection = np.arange(self.size) % self.rotations, np.arange(self.size) // self.rotations
+        sign = 1 - 2 * reflection
+        angle = (rotation[:, None] + sign[:, None] * rotation[None]) % self.rotations
+        return (reflection[:, None] ^ reflection[None]) * self.rotations + angle
 
     @cached_property
     def inverse(self) -> NDArray[np.int64]:
-        """(G,): the element that undoes each."""
+        """(G,): the inverse of each element."""
         return np.argmin(self.product, axis=1)  # the identity is element 0
 
     @cached_property
     def quotient(self) -> NDArray[np.int64]:
-        """(G, G): entry [g, h] is g^-1 h, which is how a regular field's channels are shuffled."""
+        """(G, G): entry [g, h] is the element g^-1 h, which permutes the channels of a regular field."""
         return self.product[self.inverse]
 
     @cached_property
     def determinants(self) -> NDArray[np.float64]:
-        """(G,): -1 for an element that mirrors, else 1."""
-        return np.where(np.arange(self.size) >= self.turns, -1.0, 1.0)
+        """(G,): -1 for a reflection, 1 for a rotation."""
+        return np.where(np.arange(self.size) >= self.rotations, -1.0, 1.0)
 
     def rotation(self, frequency: int = 1) -> NDArray[np.float64]:
-        """(G, 2, 2): how (cos, sin) of `frequency` times a direction's angle change; frequency 1 moves vectors (x, y).
+        """Return the two-dimensional representation (G, 2, 2) of a frequency; frequency 1 transforms vectors (x, y).
 
-        A mirroring negates the sine, a turn by a rotates by `frequency` a.
+        It acts on (cos, sin) of `frequency` times the angle of a direction: the reflection negates the sine, a rotation
+        by an angle a rotates the pair by `frequency` a.
         """
-        angle = frequency * 2 * np.pi * (np.arange(self.size) % self.turns) / self.turns
+        angle = frequency * 2 * np.pi * (np.arange(self.size) % self.rotations) / self.rotations
         cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
-        turn[..., 1] *= self.determinants[:, None]
-        return turn.round(DECIMALS) + 0.0
+        matrices = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+        matrices[..., 1] *= self.determinants[:, None]
+        return matrices.round(DECIMALS) + 0.0
 
 
 @lru_cache
@@ -94,7 +96,7 @@ def make_group(name: str) -> PlanarGroup:
 
 
 def block_diagonal(blocks: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Join representations (G, d_i, d_i) into one (G, d, d) that moves each block's entries by themselves."""
+    """Return the direct sum (G, d, d) of representations (G, d_i, d_i): one block each on the diagonal."""
     size = sum(block.shape[-1] for block in blocks)
     joined = np.zeros((len(blocks[0]), size, size))
     start = 0

@@ -26,7 +26,7 @@ class PlanarTransform:
     def of_element(cls, group: PlanarGroup, element: int, like: Tensor) -> PlanarTransform:
         """Return the transform by a group element for every sample of `like` (B, ...)."""
         angle = like.new_full((len(like),), group.angle(element))
-        return cls(angle, torch.full_like(angle, group.flips(element), dtype=torch.bool))
+        return cls(angle, torch.full_like(angle, group.reflects(element), dtype=torch.bool))
 
     def repeated(self, times: int) -> PlanarTransform:
         """Return the transforms of a batch that holds these samples `times` times, one copy after the other."""

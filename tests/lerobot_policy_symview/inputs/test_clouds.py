@@ -1,4 +1,4 @@
-"""Points and voxels of rendered scenes, and PointNet++'s choices, against slow references."""
+"""Point clouds and voxels of rendered scenes, and PointNet++'s sampling and grouping, against slow references."""
 
 import math
 
@@ -38,7 +38,7 @@ def make_cloud(scene, ceiling=1.0):
     )
 
 
-def test_points_are_where_the_camera_module_says(scene):
+def test_points_match_unproject(scene):
     cloud = make_cloud(scene)
     camera = make_camera()
     stored = scene["camera.side.world_from_cam"].reshape(4, 4).astype(np.float64)
@@ -51,13 +51,13 @@ def test_points_are_where_the_camera_module_says(scene):
     assert (valid == inside).mean() > 0.9999
 
 
-def test_the_ceiling_leaves_out_the_arm(scene):
+def test_ceiling_removes_the_arm(scene):
     low = make_cloud(scene, ceiling=0.06)
     assert float(low.position[..., 2].max()) < 0.06
     assert make_cloud(scene).valid.sum() > low.valid.sum() > 1000
 
 
-def test_invalid_depth_is_no_point():
+def test_invalid_depth_gives_no_valid_point():
     camera = make_camera(size=8)
     depth = torch.full((1, 1, 8, 8), torch.nan)
     depth[..., 0, 0], depth[..., 0, 1], depth[..., 0, 2] = 0.0, torch.inf, -1.0
@@ -75,7 +75,7 @@ def test_invalid_depth_is_no_point():
     assert (voxelize(cloud, WORKSPACE) == 0).all()
 
 
-def test_voxels_hold_the_mean_colour_of_their_points(scene):
+def test_voxels_have_the_mean_colour_of_their_points(scene):
     cloud = make_cloud(scene)
     grid = voxelize(cloud, WORKSPACE)[0].numpy()
     expected: dict[tuple[int, ...], list[np.ndarray]] = {}
@@ -89,14 +89,14 @@ def test_voxels_hold_the_mean_colour_of_their_points(scene):
         np.testing.assert_allclose(grid[1:, *voxel], np.mean(shades, axis=0), atol=1e-5)
 
 
-def test_voxels_turn_with_the_scene(scene):
+def test_voxels_transform_with_the_scene(scene):
     cloud = make_cloud(scene)
-    quarter = PlanarTransform(torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([True]))
-    moved = voxelize(cloud.transformed(quarter), WORKSPACE)
-    torch.testing.assert_close(moved, torch.rot90(voxelize(cloud, WORKSPACE).flip(-1), 1, (-2, -1)))
+    transform = PlanarTransform(torch.tensor([math.pi / 2], dtype=torch.float64), torch.tensor([True]))
+    transformed = voxelize(cloud.transformed(transform), WORKSPACE)
+    torch.testing.assert_close(transformed, torch.rot90(voxelize(cloud, WORKSPACE).flip(-1), 1, (-2, -1)))
 
 
-def test_sampled_points_are_valid_and_repeat_only_if_there_are_too_few(scene):
+def test_sampled_points_are_valid_and_repeat_only_if_too_few(scene):
     cloud = make_cloud(scene)
     points = cloud.sample(1024, shuffle=False)
     assert len({tuple(point) for point in points[0].tolist()}) == 1024
@@ -108,7 +108,7 @@ def test_sampled_points_are_valid_and_repeat_only_if_there_are_too_few(scene):
     assert len({tuple(point) for point in repeated.tolist()}) == 3
 
 
-def test_farthest_points_and_neighborhoods_are_what_loops_find():
+def test_farthest_points_and_neighborhoods_match_loops():
     points = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(0))
     chosen = farthest_points(points, 6)
     for cloud, order in zip(points, chosen, strict=True):
@@ -118,9 +118,9 @@ def test_farthest_points_and_neighborhoods_are_what_loops_find():
             taken.append(int(np.argmax(distances)))
         assert order.tolist() == taken
     squared = torch.cdist(points[:, :5], points).square()
-    found = neighborhoods(squared.topk(8, largest=False), 0.3)
+    grouped = neighborhoods(squared.topk(8, largest=False), 0.3)
     for scene_index in range(2):
         for center in range(5):
             within = [i for i in range(40) if squared[scene_index, center, i] <= 0.09]
             nearest = sorted(within, key=lambda i: float(squared[scene_index, center, i]))[:8]
-            assert found[scene_index, center].tolist() == nearest + [center] * (8 - len(nearest))
+            assert grouped[scene_index, center].tolist() == nearest + [center] * (8 - len(nearest))

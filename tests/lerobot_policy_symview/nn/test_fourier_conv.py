@@ -98,8 +98,8 @@ def test_the_layer_is_equivariant(pool):
 def transform(images, element):
     """Transform fields (B, 8 n, H, W) by an element of D4; rows are x and columns y."""
     blocks = images.unflatten(1, (D4.size, -1))[:, D4.quotient[element]].flatten(1, 2)
-    blocks = blocks.flip(-1) if D4.flips(element) else blocks
-    return blocks.rot90(element % D4.turns, (-2, -1))
+    blocks = blocks.flip(-1) if D4.reflects(element) else blocks
+    return blocks.rot90(element % D4.rotations, (-2, -1))
 
 
 def test_unsupported_inputs_fall_back_to_the_dense_convolution():

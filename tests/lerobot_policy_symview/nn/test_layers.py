@@ -38,8 +38,8 @@ def transform_fields(values, group, element):
 
 
 def transform_pixels(values, group, element):
-    flipped = values.flip(-1) if group.flips(element) else values
-    return torch.rot90(flipped, 4 * (element % group.turns) // group.turns, (-2, -1))
+    flipped = values.flip(-1) if group.reflects(element) else values
+    return torch.rot90(flipped, 4 * (element % group.rotations) // group.rotations, (-2, -1))
 
 
 EXACT = ["D4", "C4"]

@@ -74,7 +74,7 @@ def test_the_actor_is_equivariant_and_the_critic_invariant_after_updates(method)
             return learner.critic.q_functions(learner.critic.encoder(*learner.policy.network_input(batch)), action)
 
     expected = q(raw, action)
-    for element in (1, group.turns, group.size - 1):  # a rotation and a reflection generate the others
+    for element in (1, group.rotations, group.size - 1):  # a rotation and a reflection generate the others
         transformed = transform_observation(raw, config, group, element)
         transformed_action = config.actions.transform(
             action, PlanarTransform.of_element(group, element, action), absolute_yaw=False
