@@ -55,7 +55,7 @@ class SymviewConfig(PreTrainedConfig):
     """`equivariant`, `plain`, `relaxed` (equivariant at the start), or of points lifted from the camera's image:
     `voxel`, `point_cloud`."""
     group: str = from_method()
-    """Symmetry group of the network: `D4`, `C4`, `D8`, `C8` or, for the plain one, `C1`."""
+    """Symmetry group of the network: `D4`, `C4`, `D8`, `C8` or, for the plain encoder, `C1`."""
     gripper_input: Literal["image", "vector", "none"] = from_method()
     """How the gripper's pose enters: `image` draws it into a top-down view and adds its height; `vector` gives every
     pixel x, y, z and (cos, sin) of twice the yaw; `none` leaves the paper's channels, colour, height and aperture."""
@@ -136,7 +136,7 @@ class SymviewConfig(PreTrainedConfig):
         if (self.encoder == "plain") != (self.group == "C1"):
             raise ValueError(
                 f"--policy.encoder={self.encoder} cannot have --policy.group={self.group}: "
-                "the plain encoder has the group C1, and only that one has"
+                "only the plain encoder has the group C1"
             )
         if self.encoder in ("relaxed", *POINT_ENCODERS) and not make_group(self.group).is_exact:
             raise ValueError(
@@ -195,7 +195,7 @@ class SymviewConfig(PreTrainedConfig):
 
     @property
     def is_computed(self) -> bool:
-        """Whether the view is made from a camera's image rather than being one."""
+        """Whether the view is made from a camera's image; `side` and `top` are camera images."""
         return self.view.name not in CAMERA_IMAGES
 
     @property

@@ -86,8 +86,8 @@ def equivariance_errors(
     group = checked_group(config)
     training = policy.training
 
-    def act(seen: ObservationBatch) -> Tensor:
-        action: Tensor = postprocess(policy.select_action(preprocess(dict(seen))))
+    def act(batch: ObservationBatch) -> Tensor:
+        action: Tensor = postprocess(policy.select_action(preprocess(dict(batch))))
         return action
 
     action = act(raw)

@@ -59,8 +59,7 @@ def model_card(
         "## Inputs and outputs\n",
         f"The observation is {observation.format(camera=config.camera)} ({config.modality.upper()}, "
         f"{config.crop_size} pixels), and the state. The network ({config.encoder} encoder, group {config.group}, "
-        f"width {config.width}, {parameters:,} parameters) is "
-        + ("not equivariant.\n" if config.group == "C1" else "equivariant: actions transform with the scene.\n"),
+        f"width {config.width}, {parameters:,} parameters) is " + f"{_symmetry(config)}.\n",
         "| feature | representation of each dimension |\n|---|---|",
         f"| `observation.state` | {', '.join(config.state_symmetry)} |",
         f"| `action` | {', '.join(config.action_symmetry)}; {yaw} |\n",
@@ -80,3 +79,14 @@ def _evaluation(evaluation: Sequence[dict[str, float]]) -> str:
         return "Not evaluated during training; the command below evaluates it.\n"
     rows = [f"| {row['step']:,.0f} | {100 * row['success']:.0f} % | {row['return']:.2f} |" for row in evaluation]
     return "\n".join(["| step | success | discounted return |", "|---|---|---|", *rows, ""])
+
+
+def _symmetry(config: SymviewConfig) -> str:
+    """Return how the policy's actions relate to transforms of the scene (paper sections 5.6 and 5.7)."""
+    if config.group == "C1":
+        return "not equivariant"
+    if config.encoder == "relaxed":
+        return "equivariant at initialisation; training relaxes this"
+    if config.camera_direction:
+        return "equivariant if the camera moves with the scene"
+    return "equivariant: actions transform with the scene"

@@ -185,16 +185,16 @@ def delivered_units(meta: Any) -> dict[str, Unit]:
 
 def _metres(depth: Tensor, unit: Unit) -> Tensor:
     depth = depth if depth.is_floating_point() else depth.float()
-    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which gives other bits.
+    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which rounds differently.
     return depth if unit == "m" else depth / depth.new_full((), MILLIMETRES_PER_METRE)
 
 
-def _matrices(key: str, stated: Tensor, side: int, count: int) -> NDArray[np.floating]:
+def _matrices(key: str, matrix: Tensor, side: int, count: int) -> NDArray[np.floating]:
     """Return (count, side^2): a matrix for each frame, or one for all, which LeRobot leaves without a batch axis."""
     shapes = [(side**2,), (side, side), (count, side**2), (count, side, side)]
-    if tuple(stated.shape) not in shapes:
-        raise CalibrationError(f"{key} has shape {tuple(stated.shape)}, expected one of {shapes}")
-    return np.broadcast_to(stated.detach().cpu().numpy().reshape(-1, side**2), (count, side**2))
+    if tuple(matrix.shape) not in shapes:
+        raise CalibrationError(f"{key} has shape {tuple(matrix.shape)}, expected one of {shapes}")
+    return np.broadcast_to(matrix.detach().cpu().numpy().reshape(-1, side**2), (count, side**2))
 
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
@@ -202,7 +202,7 @@ def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     from lerobot_symview.views.torch_backend import can_batch, render_batch
 
     device = batch.rgb.device
-    if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which the bits depend on
+    if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which bit-identical images need
         return render_batch(view, batch)
     rgb = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu().numpy()
     depth, gripper = (None if one is None else one.cpu().numpy() for one in (batch.depth, batch.gripper))

@@ -1,4 +1,4 @@
-"""The one place that forms what the network sees of a scene: top-down or camera images, or points in space.
+"""Forms the network's input from a preprocessed observation: top-down or camera images, or points in space.
 
 `make_scene_input` chooses the strategy once, from the configuration. Everything it does commutes with the network's
 group: the centre crop, the drawn gripper, the lifting of pixels to points.
@@ -55,7 +55,7 @@ class SceneInput(ABC):
 
         Args:
             batch: preprocessed observations, colour in [0, 1], depth in metres.
-            transform: of the scene before it is seen; by default none.
+            transform: planar transform of each scene; by default none.
             crop_offset: (B, 2) in [0, 1), row and column relative to the largest offset; by default the centre crop.
             shuffle: sample points at random.
         """
@@ -97,15 +97,15 @@ class ImageInput(SceneInput):
     def keys(self) -> list[str]:
         """The view's colour and height, the state, and the camera's calibration where it is used."""
         config = self.config
-        found = [config.color_key, keys.STATE]
+        features = [config.color_key, keys.STATE]
         if config.modality == "rgbd":
             assert config.height_key is not None
-            found.append(config.height_key)
+            features.append(config.height_key)
         if config.camera_direction:
-            found += [keys.intrinsics(config.camera), keys.world_from_cam(config.camera)]
+            features += [keys.intrinsics(config.camera), keys.world_from_cam(config.camera)]
         if config.view.name == "top" and config.modality == "rgbd":
-            found.append(keys.world_from_cam("top"))
-        return found
+            features.append(keys.world_from_cam("top"))
+        return features
 
     def form(
         self,
