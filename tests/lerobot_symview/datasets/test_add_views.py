@@ -212,7 +212,7 @@ def test_a_view_of_one_channel_is_refused_for_stock_policies():
 
     with registered(VIEWS, "metres", Metres):
         AddViewsConfig(HubDataset("a/b"), views=["metres"])
-        with pytest.raises(ValueError, match=r"--for_stock_policies=true .* the view makes metres, which has one"):
+        with pytest.raises(ValueError, match=r"--for_stock_policies=true .* the view outputs metres, which has one"):
             AddViewsConfig(HubDataset("a/b"), views=["metres"], for_stock_policies=True)
 
 
