@@ -65,7 +65,7 @@ class Registry[Value]:
             ValueError: if the name is already registered.
         """
         if name in self:
-            raise ValueError(f"a {self.kind} named {name!r} is registered already")
+            raise ValueError(f"a {self.kind} named {name!r} is already registered")
 
         def register(item: Item) -> Item:
             self._registered[name] = cast(Any, item)

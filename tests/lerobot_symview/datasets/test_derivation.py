@@ -69,9 +69,9 @@ def test_an_interrupted_run_is_resumed(recorded, reference, tmp_path, monkeypatc
         with pytest.raises(KeyboardInterrupt):
             add_views(views_config(recorded, target))
     assert not target.exists()
-    with pytest.raises(CommandError, match="begun and interrupted: add --resume=true"):
+    with pytest.raises(CommandError, match="is from an interrupted run: add --resume=true"):
         add_views(views_config(recorded, target))
-    with pytest.raises(CommandError, match="begun with another views: repeat the command"):
+    with pytest.raises(CommandError, match="is from a run with different views: repeat that command"):
         add_views(views_config(recorded, target, size=VIEW_SIZE + 2, resume=True))
     kept = next((tmp_path / "derived.partial").rglob("*.parquet"))
     written_at = kept.stat().st_mtime_ns
