@@ -115,8 +115,8 @@ def _check_no_foreign_files(folder: Path) -> None:
         foreign = sorted(path.name for path in folder.iterdir() if not path.match(f"{REQUEST}.*.part"))
     if foreign:
         raise CommandError(
-            f"results are written to {folder} first, which holds other files "
-            f"({', '.join(foreign[:3])}): move them elsewhere or choose another folder for the result"
+            f"{folder} is needed for partial results and was not created by an earlier run "
+            f"({', '.join(foreign[:3])}): move it elsewhere or choose another folder for the result"
         )
 
 

@@ -24,7 +24,7 @@ def test_foreign_files_in_the_partial_folder_are_not_modified(recorded, tmp_path
     kept = tmp_path / "derived.partial" / name
     kept.parent.mkdir(parents=True)
     kept.write_text("user data")
-    with pytest.raises(CommandError, match=rf"holds other files \({Path(name).parts[0]}\): move them"):
+    with pytest.raises(CommandError, match=rf"not created by an earlier run \({Path(name).parts[0]}\): move it"):
         add_views(views_config(recorded, tmp_path / "derived", resume=resume))
     assert kept.read_text() == "user data"
     assert not (tmp_path / "derived").exists()
