@@ -79,7 +79,8 @@ def test_transforming_world_and_camera_transforms_the_view_exactly(quarter_turns
     labels = np.arange(depth.size, dtype=np.int64).reshape(depth.shape)
     buffer = zbuffer_from_depth([depth], [camera], workspace, SIZE)
     transformed_camera, transformed_depth = transformed(camera, depth, quarter_turns, reflect)
-    transformed_buffer = zbuffer_from_depth([np.ascontiguousarray(transformed_depth)], [transformed_camera], workspace, SIZE)
+    depths = [np.ascontiguousarray(transformed_depth)]
+    transformed_buffer = zbuffer_from_depth(depths, [transformed_camera], workspace, SIZE)
     np.testing.assert_array_equal(transformed_buffer.height, transformed_image(buffer.height, quarter_turns, reflect))
     source = np.where(buffer.source == EMPTY, EMPTY, labels.ravel()[buffer.source])
     flipped = labels[:, ::-1] if reflect else labels
