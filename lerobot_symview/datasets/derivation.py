@@ -158,9 +158,9 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
                     arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
                     # one row group per episode, as LeRobot writes them
                     writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
-                    for key, one in statistics.items():
-                        summaries[key].append(one.summary())
-                        merged[key].merge(one)
+                    for key, episode_statistics in statistics.items():
+                        summaries[key].append(episode_statistics.summary())
+                        merged[key].merge(episode_statistics)
             with statistics_part.open("wb") as stream:
                 np.savez_compressed(stream, **_packed(merged, summaries))
             for done, file in ((statistics_part, statistics_file), (table_part, table_file)):
@@ -210,8 +210,8 @@ def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
 
 def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
     packed: dict[str, Any] = {}
-    for key, one in merged.items():
-        packed |= {f"{key}/images": one.images, f"{key}/counts": one.counts, f"{key}/sums": one.sums}
+    for key, total in merged.items():
+        packed |= {f"{key}/images": total.images, f"{key}/counts": total.counts, f"{key}/sums": total.sums}
         packed[f"{key}/summaries"] = np.stack(summaries[key])
     return packed
 
@@ -261,7 +261,7 @@ def _collect_statistics(
     for key, values in _added_vectors(derivation).items():
         collected[key] = constant_summary(values, sum(lengths))
         each = [constant_summary(values, length) for length in lengths]
-        of_episodes[key] = {name: [one[name] for one in each] for name in each[0]}
+        of_episodes[key] = {name: [summary[name] for summary in each] for name in each[0]}
     return collected, of_episodes
 
 

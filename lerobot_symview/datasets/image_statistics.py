@@ -63,8 +63,8 @@ class ImageStatistics:
         total = self.counts.sum(axis=1)
         if self.kind == "rgb":
             levels: NDArray = np.arange(256) / 255
-            seen = self.counts > 0
-            minimum, maximum = levels[seen.argmax(axis=1)], levels[255 - seen[:, ::-1].argmax(axis=1)]
+            occupied = self.counts > 0
+            minimum, maximum = levels[occupied.argmax(axis=1)], levels[255 - occupied[:, ::-1].argmax(axis=1)]
             mean = self.counts @ levels / total
             variance = self.counts @ levels**2 / total - mean**2
         else:

@@ -111,7 +111,7 @@ class CameraSpec:
             if workspace.visible_fraction(camera) >= minimum_visible:
                 break
             camera = self._camera(workspace, rng)
-        remedy = "raise its distance or fov_deg, turn it towards the workspace, or lower its spread"
+        remedy = "raise its distance or fov_deg, point it at the workspace, or lower its spread"
         check_visible(self.name, camera, workspace, remedy, minimum_visible)
         return camera
 

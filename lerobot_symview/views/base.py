@@ -221,4 +221,4 @@ def gray_to_rgb(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def check_size(size: int) -> None:
     """Raise a ValueError unless `size` is a valid number of rows and columns of a view."""
     if not isinstance(size, Integral) or not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"a view's size must be a whole number of {SMALLEST} to {LARGEST} pixels, got {size}")
+        raise ValueError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")

@@ -126,7 +126,7 @@ class ReprojectedView(View):
             if not math.isfinite(metres):
                 raise ValueError(f"{name} must be finite metres, got {metres}")
         if not isinstance(self.source_scale, Integral) or not 1 <= self.source_scale <= 8:
-            raise ValueError(f"source_scale must be a whole number in 1 to 8, got {self.source_scale}")
+            raise ValueError(f"source_scale must be an integer from 1 to 8, got {self.source_scale}")
 
     def without_gripper(self) -> ReprojectedView:
         """Return the view without clipping at the gripper."""
