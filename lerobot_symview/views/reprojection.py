@@ -108,7 +108,7 @@ class ReprojectedView(View):
 
     @property
     def needs_depth(self) -> bool:
-        """True."""
+        """True: the point cloud comes from the depth image."""
         return True
 
     @property

@@ -109,7 +109,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         expected.append(view.render(Frame(rgb, depth, camera, Workspace())))
         frame = {keys.rgb("wrist"): rgb, keys.depth("wrist"): depth[..., None], keys.ACTION: np.zeros(1, np.float32)}
         calibration = {keys.intrinsics("wrist"): intrinsics.ravel(), keys.world_from_cam("wrist"): pose.ravel()}
-        source.add_frame(frame | calibration | {"task": "nothing"})
+        source.add_frame(frame | calibration | {"task": "none"})
     source.save_episode()
     source.finalize()
     config = views_config(
@@ -151,7 +151,7 @@ def record_real_robot(folder, camera, rgb, use_videos=False):
     for _ in range(3):
         angles = rng.normal(size=6).astype(np.float32)
         frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
-        source.add_frame(frame | {"task": "nothing"})
+        source.add_frame(frame | {"task": "none"})
     source.save_episode()
     source.finalize()
     return depth

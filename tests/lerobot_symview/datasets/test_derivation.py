@@ -58,11 +58,11 @@ def test_parts_are_cut_at_episodes_within_files(recorded, small_parts):
 def test_an_interrupted_run_is_resumed(recorded, reference, tmp_path, monkeypatch):
     target, written = tmp_path / "derived", []
 
-    def fail_at_the_second(one, part):
+    def fail_at_the_second(config, part):
         if written:
             raise KeyboardInterrupt
         written.append(part)
-        return derivation.write_part(one, part)
+        return derivation.write_part(config, part)
 
     with monkeypatch.context() as patched:
         patched.setattr("lerobot_symview.datasets.add_views.write_part", fail_at_the_second)

@@ -58,8 +58,8 @@ def test_batches_are_bit_identical_to_single_frames(name, options, device, views
     images = render_batch(view, batch_of(frames, device))
     assert list(images) == list(view.outputs)
     for output, stacked in images.items():
-        for one, image in zip(expected, stacked.cpu().numpy(), strict=True):
-            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, one[output])
+        for single, image in zip(expected, stacked.cpu().numpy(), strict=True):
+            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, single[output])
 
 
 @pytest.mark.parametrize("device", DEVICES)
