@@ -7,8 +7,8 @@ camera = sv.Camera(K, world_from_cam, height=480, width=640)
 top = sv.reproject(rgb, depth, camera, sv.Workspace(center=(0.45, 0.0), size=0.4))
 ```
 
-Neither a simulator nor a neural network is imported. Names are imported when they are first used, since a simulator's
-process can do without OpenCV.
+This package imports neither a simulator nor a neural network. Public names are imported on first use, so that simulator
+processes do not load OpenCV.
 """
 
 from importlib import import_module
@@ -64,7 +64,7 @@ _MODULE_OF_NAME = {name: module for module, names in _NAMES_OF_MODULE.items() fo
 
 
 def __getattr__(name: str) -> Any:
-    """Import and return a public name."""
+    """Import a public name on first use."""
     if name not in _MODULE_OF_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULE_OF_NAME[name]}"), name)

@@ -1,19 +1,19 @@
-"""Mistakes that a user can correct: each message says what was found and what was expected.
+"""Errors that a user can correct. Each message gives the value received and the value expected.
 
-The library's messages name no command-line flag: it does not know who calls it. A command adds its flag
-(`lerobot_symview.runtime.cli.flagged`).
+Library messages name no command-line flag, because Python code calls the same functions. Commands add their flag with
+`lerobot_symview.runtime.cli.flagged`.
 """
 
 from __future__ import annotations
 
 
 class SymviewError(Exception):
-    """A mistake that the user can correct; the message says how."""
+    """Base class of errors that a user can correct; the message says how."""
 
 
 class CalibrationError(SymviewError, ValueError):
-    """A camera's intrinsics or pose cannot describe a pinhole camera over the table."""
+    """A camera's intrinsics or pose are invalid, or too little of the workspace is in its image."""
 
 
 class DatasetError(SymviewError):
-    """A dataset is missing, malformed, or lacks what is asked of it."""
+    """A dataset is missing or malformed, or lacks a required feature or file."""

@@ -1,4 +1,4 @@
-"""Names of a dataset's features: one place, so that the simulator, the views and the policies agree."""
+"""Feature names of a dataset, shared by the simulator, the views and the policies."""
 
 STATE = "observation.state"
 ACTION = "action"
@@ -17,20 +17,20 @@ def depth(camera: str) -> str:
 
 
 def segmentation(camera: str) -> str:
-    """uint8 (H, W, 3) label of what a pixel shows, the same in each channel: 0 table, 1 robot, 2 and up objects."""
+    """uint8 (H, W, 3) segmentation label, repeated in the three channels: 0 table, 1 robot, 2 and up objects."""
     return f"observation.images.{camera}_segmentation"
 
 
 def intrinsics(camera: str) -> str:
-    """float32 (9,) K in pixels, row-major."""
+    """float32 (9,) 3 x 3 intrinsic matrix K in pixels, row-major."""
     return f"observation.camera.{camera}.intrinsics"
 
 
 def world_from_cam(camera: str) -> str:
-    """float32 (16,) pose, row-major, metres."""
+    """float32 (16,) 4 x 4 camera-to-world transform, row-major, metres."""
     return f"observation.camera.{camera}.world_from_cam"
 
 
 def view(camera: str, output: str) -> str:
-    """Image that a view made from `camera`, such as `reproj` or `reproj_height`."""
+    """Output of a view rendered from `camera`; `output` is, for example, `reproj` or `reproj_height`."""
     return f"observation.images.{camera}_{output}"

@@ -1,4 +1,4 @@
-"""Registries: what a user selects by name. Built-in entries, entry points of installed packages, and registrations.
+"""Registries of views, tasks and encoders: built-in entries, entry points, and entries registered at run time.
 
 ```python
 from lerobot_symview import register_view
@@ -9,9 +9,9 @@ from lerobot_symview import register_view
 class MyView(View): ...
 ```
 
-An installed package adds to the same registry by an entry point, in the group `symview.views`, `symview.tasks` or
-`symview.encoders`. Worker processes see entry points; they do not see what was registered in the process that started
-them.
+An installed package adds entries to the same registries through entry points, in the groups `symview.views`,
+`symview.tasks` and `symview.encoders`. Worker processes load entry points; they do not inherit entries that were
+registered at run time in the parent process.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from typing import Any, cast
 
 
 def lookup[Value](kind: str, name: str, known: Mapping[str, Value]) -> Value:
-    """Return `known[name]`; an unknown name raises a ValueError that lists the known ones and the nearest."""
+    """Return `known[name]`; raise a ValueError that lists the known names and the closest match otherwise."""
     check_name(kind, name, known)
     return known[name]
 
 
 def check_name(kind: str, name: str, known: Iterable[str]) -> None:
-    """Raise a ValueError, with the nearest known name, unless `name` is one of `known`."""
+    """Raise a ValueError that suggests the closest known name unless `name` is in `known`."""
     names = list(known)
     if name not in names:
         guess = difflib.get_close_matches(name, names, n=1)
@@ -45,27 +45,27 @@ def installed(group: str) -> dict[str, EntryPoint]:
 
 
 class Registry[Value]:
-    """Named things of one kind.
+    """Entries of one kind, such as views, by name.
 
     Args:
-        kind: what error messages call one, such as `view`.
-        group: the entry points' group, such as `symview.views`.
-        builtin: name -> `module:attribute`, imported when it is first asked for.
+        kind: noun for an entry in error messages, such as `view`.
+        group: entry point group, such as `symview.views`.
+        builtin: name -> `module:attribute`, imported on first use.
     """
 
     def __init__(self, kind: str, group: str, builtin: Mapping[str, str] | None = None):
         self.kind, self.group = kind, group
-        self._builtin = {name: EntryPoint(name, place, group) for name, place in (builtin or {}).items()}
+        self._builtin = {name: EntryPoint(name, target, group) for name, target in (builtin or {}).items()}
         self._registered: dict[str, Value] = {}
 
     def register[Item](self, name: str) -> Callable[[Item], Item]:
         """Return a decorator that makes a class or function selectable as `name` in this process.
 
         Raises:
-            ValueError: if the name is taken.
+            ValueError: if the name is already registered.
         """
         if name in self:
-            raise ValueError(f"a {self.kind} named {name!r} is registered already")
+            raise ValueError(f"a {self.kind} named {name!r} is already registered")
 
         def register(item: Item) -> Item:
             self._registered[name] = cast(Any, item)
@@ -74,7 +74,7 @@ class Registry[Value]:
         return register
 
     def unregister(self, name: str) -> None:
-        """Remove what was registered as `name` in this process."""
+        """Remove the entry that was registered as `name` in this process."""
         del self._registered[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -90,19 +90,19 @@ class Registry[Value]:
 
     @property
     def registered(self) -> tuple[str, ...]:
-        """Names that were registered in this process."""
+        """Names of the entries registered in this process."""
         return tuple(self._registered)
 
     def check(self, name: str, kind: str | None = None) -> None:
-        """Raise a ValueError, with the nearest known name, unless `name` is selectable; `kind` replaces the kind."""
+        """Raise a ValueError that suggests the closest known name if `name` is unknown; `kind` overrides the noun."""
         if name not in self:
             check_name(kind or self.kind, name, self)
 
     def __getitem__(self, name: str) -> Value:
-        """Return what is registered as `name`, imported now if it was not before.
+        """Return the entry `name`; it is imported on first use.
 
         Raises:
-            ValueError: if nothing is; the message has the nearest known name.
+            ValueError: if the name is unknown; the message suggests the closest known name.
         """
         if name in self._registered:
             return self._registered[name]

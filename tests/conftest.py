@@ -1,4 +1,4 @@
-"""Shared fixtures: a tiny recorded dataset and the same with views, made once by the library itself."""
+"""Shared fixtures: a small recorded dataset and copies of it with views, created once per session by the library."""
 
 import atexit
 import os
@@ -6,12 +6,12 @@ import shutil
 import tempfile
 from pathlib import Path
 
-# Hugging Face's libraries and numba read these when they are imported, which happens below.
+# Hugging Face's libraries and numba read these variables at import, which happens below.
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["HF_DATASETS_DISABLE_PROGRESS_BARS"] = "1"
-# Compiled kernels check every index, and are kept apart from those that do not.
+# Compiled kernels check array bounds; their cache is separate from that of unchecked kernels.
 os.environ["NUMBA_BOUNDSCHECK"] = "1"
-if "PYTEST_XDIST_WORKER" not in os.environ:  # its workers share what the first process made
+if "PYTEST_XDIST_WORKER" not in os.environ:  # xdist workers share the folders of the first process
     scratch = tempfile.mkdtemp(prefix="symview-tests-")
     os.environ |= {"HF_HOME": f"{scratch}/huggingface", "NUMBA_CACHE_DIR": f"{scratch}/numba"}
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
@@ -25,7 +25,7 @@ from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.generate import GenerateConfig, generate
 from symview_sim.settings import NewDataset
 
-# The same examples every time, so that a failure can be repeated; no time limit, since the first one compiles.
+# Deterministic examples, so that failures are reproducible; no deadline, since the first example compiles kernels.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("repeatable")
 
@@ -34,20 +34,20 @@ EPISODES = 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the slowest files, so that processes that share the rest end together."""
+    """Run the slowest files first, so that xdist workers finish at about the same time."""
     items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("slow", "long")])
 
 
 @pytest.fixture
 def unchecked_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let commands in processes of their own train as fast as for users: checking indices takes 3.5 times as long."""
+    """Disable bounds checks in commands run as subprocesses: with checks, training takes 3.5 times as long."""
     monkeypatch.setenv("NUMBA_BOUNDSCHECK", "0")
     monkeypatch.setenv("NUMBA_CACHE_DIR", f"{os.environ['NUMBA_CACHE_DIR']}-unchecked")
 
 
 @pytest.fixture(scope="session")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a dataset of two demonstrations with the cameras `side` and `top`."""
+    """Folder of a dataset with two demonstrations and the cameras `side` and `top`."""
     folder = tmp_path_factory.mktemp("data") / "recorded"
     return generate(GenerateConfig(NewDataset("test/recorded", folder), num_episodes=EPISODES))
 

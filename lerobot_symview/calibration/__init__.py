@@ -1,1 +1,1 @@
-"""Reading what is known of cameras that datasets and observations do not describe themselves."""
+"""Camera calibration from files, for datasets and robots that do not store it."""

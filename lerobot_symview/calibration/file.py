@@ -1,11 +1,12 @@
-"""Calibration from a file, for datasets and robots that do not carry their own.
+"""Camera calibration from a file, for datasets and robots that do not store it.
 
-Matrices are rounded to float32, as which datasets store them, so that a view has the same bits whichever it is made by.
+Matrices are rounded to float32, the precision of datasets, so that views rendered with the file's matrices and with a
+dataset's stored matrices are bit-identical.
 
 The file is YAML or JSON:
 
-    units: m                        # of the poses, m or mm; K is in pixels
-    workspace:                      # the square seen from above, metres; optional
+    units: m                        # of the translations, m or mm; K is in pixels
+    workspace:                      # the square on the table that views show, metres; optional
       center: [0.45, 0.0]
       size: 0.4
     cameras:
@@ -39,16 +40,16 @@ CAMERA_ENTRIES = ("height", "width", "intrinsics", "world_from_cam")
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras that do not move, by name, and the workspace they look at, where that is stated."""
+    """Fixed cameras by name, and the workspace if the file declares one."""
 
     cameras: dict[str, Camera]
     workspace: Workspace | None = None
 
     def camera(self, name: str) -> Camera:
-        """Return a camera.
+        """Return the camera `name`.
 
         Raises:
-            CalibrationError: if it is not among them.
+            CalibrationError: if the calibration has no such camera.
         """
         if name not in self.cameras:
             raise CalibrationError(f"the calibration has no camera {name!r}; it has {', '.join(self.cameras)}")
@@ -56,18 +57,18 @@ class Calibration:
 
 
 def read_calibration(file: Path | str) -> Calibration:
-    """Read the file that is described at the top of this module.
+    """Read a calibration file in the format described at the top of this module.
 
     Raises:
-        CalibrationError: if it cannot be read as YAML or JSON, or everything that is wrong with its content, in one
-            message.
+        CalibrationError: if the file cannot be read as YAML or JSON, or its content is invalid; one message lists all
+            problems.
     """
     import yaml
 
     try:
         text = Path(file).read_text()
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise CalibrationError(f"{file} has an alias (*name): write out what it refers to")
+            raise CalibrationError(f"{file} has an alias (*name): write out the value it refers to")
         content = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise CalibrationError(f"cannot read {file}: {error}") from None
@@ -78,20 +79,20 @@ def read_calibration(file: Path | str) -> Calibration:
 
 
 def parse_calibration(content: Any) -> Calibration:
-    """Return the calibration that a parsed file states.
+    """Return the calibration that the content of a file describes.
 
     Raises:
-        CalibrationError: all that is wrong with it, in one message.
+        CalibrationError: if the content is invalid; one message lists all problems.
     """
     if not isinstance(content, Mapping):
         raise CalibrationError(f"expected a mapping with units and cameras, got {type(content).__name__}")
-    problems = _strangers("the file", content, ("units", "workspace", "cameras"))
+    problems = _unknown_keys("the file", content, ("units", "workspace", "cameras"))
     units = content.get("units")
     if not isinstance(units, str) or units not in METRES:
         problems.append(f"units must be m or mm, got {units!r}")
     named = content.get("cameras")
     if not isinstance(named, Mapping) or not named:
-        problems.append("cameras must name at least one camera")
+        problems.append("cameras must be a mapping with at least one camera")
         named = {}
     metres = METRES.get(str(units), 1.0)
     cameras, workspace = {}, None
@@ -111,10 +112,10 @@ def parse_calibration(content: Any) -> Calibration:
 
 
 def parse_workspace(entries: Any) -> Workspace:
-    """Return the workspace that a mapping of `Workspace`'s arguments states.
+    """Return the workspace with the arguments of `Workspace` given in a mapping.
 
     Raises:
-        CalibrationError: what is wrong with it.
+        CalibrationError: if an argument is unknown or invalid.
     """
     known = [field.name for field in fields(Workspace)]
     if not isinstance(entries, Mapping) or set(entries) - set(known):
@@ -130,7 +131,7 @@ def parse_workspace(entries: Any) -> Workspace:
 
 
 def plain_calibration(calibration: Calibration) -> dict[str, Any]:
-    """Return what `parse_calibration` reads, as JSON can hold it."""
+    """Return the calibration as JSON-compatible data that `parse_calibration` reads."""
     cameras = {
         name: {
             "height": camera.height,
@@ -150,7 +151,7 @@ def _camera(entries: Any, metres: float) -> Camera:
     if not isinstance(entries, Mapping):
         raise CalibrationError(f"expected a mapping with {', '.join(CAMERA_ENTRIES)}, got {entries!r}")
     missing = [entry for entry in CAMERA_ENTRIES if entry not in entries]
-    problems = _strangers("it", entries, CAMERA_ENTRIES)
+    problems = _unknown_keys("it", entries, CAMERA_ENTRIES)
     if missing:
         problems.append(f"lacks {', '.join(missing)}")
     if problems:
@@ -160,7 +161,7 @@ def _camera(entries: Any, metres: float) -> Camera:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _matrix("intrinsics", entries, 3), _matrix("world_from_cam", entries, 4)
     world_from_cam[:3, 3] *= metres
-    return Camera(_as_stored(intrinsics), _as_stored(world_from_cam), entries["height"], entries["width"])
+    return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
 
 
 def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
@@ -170,11 +171,11 @@ def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
         raise CalibrationError(f"{name} must be {side} rows of {side} numbers, got {entries[name]!r}") from None
 
 
-def _as_stored(matrix: Array) -> Array:
-    with np.errstate(over="ignore"):  # the camera refuses what is infinite
+def _as_float32(matrix: Array) -> Array:
+    with np.errstate(over="ignore"):  # Camera rejects infinite values
         return matrix.astype(np.float32).astype(np.float64)
 
 
-def _strangers(owner: str, entries: Mapping[Any, Any], known: tuple[str, ...]) -> list[str]:
-    strangers = [str(entry) for entry in entries if entry not in known]
-    return [f"{owner} has the unknown {', '.join(strangers)}; expected {', '.join(known)}"] if strangers else []
+def _unknown_keys(owner: str, entries: Mapping[Any, Any], known: tuple[str, ...]) -> list[str]:
+    unknown = [str(key) for key in entries if key not in known]
+    return [f"{owner} has unknown keys: {', '.join(unknown)}; expected {', '.join(known)}"] if unknown else []

@@ -1,1 +1,1 @@
-"""LeRobot datasets on disk: reading them, and writing them again with views as new camera keys."""
+"""LeRobot datasets on disk: reading them, and writing copies with views as new camera keys."""

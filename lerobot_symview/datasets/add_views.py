@@ -49,34 +49,34 @@ class AddViewsConfig:
     """Add top-down views to a dataset as new camera keys. The result is a new dataset; the source is not modified."""
 
     dataset: HubDataset
-    """The source dataset, with the camera's images and calibration; the Hub options apply to the result."""
+    """The source dataset, with the camera's images and calibration; the Hub options apply to the new dataset."""
     new_repo_id: str = ""
-    """Name of the result; by default the source's with `_views` appended."""
+    """`user/name` of the new dataset; by default the source's with `_views` appended."""
     new_root: Path | None = None
-    """Folder of the result; by default LeRobot's cache folder for `new_repo_id`."""
+    """Folder of the new dataset; by default LeRobot's cache folder for `new_repo_id`."""
     views: list[ViewSpec] = field(default_factory=lambda: [ViewSpec("reproj")])
     """Views to add, by name or with options: `[reproj, {name: persp, plane_height: 0.025}]`. reproj needs depth."""
     camera: str = "side"
-    """Camera whose images are used."""
+    """Camera whose images the views are rendered from."""
     size: int | None = None
-    """Rows and columns of the views that do not have a size of their own in `views`."""
+    """Rows and columns of the views; a size given in `views` takes precedence."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
     calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without; see docs/own_camera.md."""
+    """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
     workspace: Workspace | None = None
     """Square on the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
-    default the calibration file's, else the dataset's, else the simulator's. The gripper's x and y are relative to its
-    centre."""
+    default that of the calibration file, else of the dataset, else of the simulator. The gripper's x and y are relative
+    to its centre."""
     keep: list[str] | None = None
     """Source image keys to keep, without `observation.images.`; by default all. `[]` keeps none."""
     for_stock_policies: bool = False
-    """Write only what LeRobot's own policies accept: no source image, unless `keep` names it, and no height map, which
-    has one channel."""
+    """Write only images that LeRobot's own policies accept: no source images, unless `keep` names them, and no height
+    maps, which have one channel."""
     num_workers: int = 1
-    """Processes that render views in parallel. The data does not depend on their number."""
+    """Processes that render views in parallel. The result does not depend on their number."""
     resume: bool = False
     """Continue an interrupted run of the same command."""
 
@@ -91,7 +91,8 @@ class AddViewsConfig:
         """Return the views by name.
 
         Raises:
-            ValueError: if a view or an option is unknown, or a view has no colour image for stock policies.
+            ValueError: if a view or an option is unknown or invalid, or if a view has a one-channel output that
+                `for_stock_policies` cannot disable.
         """
         views = views_from_flags(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
         if not self.for_stock_policies:
@@ -99,22 +100,22 @@ class AddViewsConfig:
         try:
             return {name: view.in_color() for name, view in views.items()}
         except ValueError as error:
-            raise ValueError(f"--for_stock_policies=true takes images of three channels: {error}") from None
+            raise ValueError(f"--for_stock_policies=true accepts three-channel images only: {error}") from None
 
     def kept_images(self) -> list[str] | None:
-        """Return the names of the source's images that are kept; None if all are."""
+        """Return the names of the source images to keep; None for all."""
         return [] if self.keep is None and self.for_stock_policies else self.keep
 
     def target(self) -> DatasetLocation:
-        """Return the location of the result."""
+        """Return the location of the new dataset."""
         return DatasetLocation(self.new_repo_id or f"{self.dataset.repo_id}_views", self.new_root)
 
 
 def add_views(config: AddViewsConfig) -> Path:
-    """Write the dataset that `config` describes, upload it if asked to, and return its folder.
+    """Write the dataset with the views of `config`, upload it with `push_to_hub`, and return its folder.
 
-    Each frame's views are rendered with its own calibration, so a camera may move. Original columns are copied bit for
-    bit and videos as files; statistics cover the new keys.
+    Views are rendered with the calibration of each frame, so cameras may move. Original columns are bit-identical to
+    the source's, videos are copied as files, and statistics are added for the new keys.
     """
     folder = _write(config)
     if config.dataset.push_to_hub:
@@ -131,7 +132,7 @@ def _write(config: AddViewsConfig) -> Path:
         derivation = _plan(config, source, partial_folder(target))
         description = _description(config, derivation)
         if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
-            logger.info("%s is complete already", target)
+            logger.info("%s is already complete", target)
             return target
         _check_first_frame(derivation, source)
         parts = cut_parts(source)
@@ -147,13 +148,13 @@ def _write(config: AddViewsConfig) -> Path:
 
 
 def _check_apart(source: Path, target: Path) -> None:
-    """Raise a ValueError if the result would lie in the source, or the source in the result."""
+    """Raise a ValueError if the source and the result would lie within each other."""
     source = source.resolve()
     for written in (target.resolve(), partial_folder(target).resolve()):
         if written.is_relative_to(source) or source.is_relative_to(written):
             raise ValueError(
                 f"the result would be written to {written} and the source is in {source}: "
-                "neither may lie in the other, choose another --new_root"
+                "neither may be inside the other, choose another --new_root"
             )
 
 
@@ -196,7 +197,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
 def calibration_and_workspace(
     file: Path | None, workspace: Workspace | None, features: Features
 ) -> tuple[Calibration | None, Workspace]:
-    """Return what `--calibration` and `--workspace` give: the file's content, and the flag's, file's or dataset's."""
+    """Return the calibration of `file`, and the workspace: the argument, else the file's, else the dataset's."""
     if file is None:
         return None, workspace or stored_workspace(features)
     with flagged("--calibration"):
@@ -205,12 +206,12 @@ def calibration_and_workspace(
 
 
 def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, View]:
-    """Return the views as they are made for a dataset: without the gripper where its state is not recorded."""
+    """Return the views, without clipping and gripper image if the dataset lacks the gripper's state."""
     using = [name for name, view in views.items() if view.uses_gripper]
     if not using or gripper_dimensions(features) is not None:
         return views
     logger.warning(
-        "%s has no dimensions named %s: %s are made without clipping at the gripper and without a gripper image",
+        "%s has no dimensions named %s: %s are rendered without clipping at the gripper and without a gripper image",
         keys.STATE,
         ", ".join(keys.STATE_NAMES),
         ", ".join(using),
@@ -221,7 +222,7 @@ def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, V
 def _check_names(config: AddViewsConfig, features: Features, added: Features) -> None:
     existing = [key for key in added if key in features]
     if existing:
-        raise ValueError(f"the dataset has {', '.join(existing)} already: take them out of --views or --calibration")
+        raise ValueError(f"the dataset already has {', '.join(existing)}: change --views or --calibration")
     prefix = keys.rgb("")
     images = sorted(key.removeprefix(prefix) for key in features if key.startswith(prefix))
     unknown = sorted(set(config.keep or []) - set(images))
@@ -230,7 +231,7 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
 
 
 def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
-    """Render the first frame, so that an error of every frame is reported before anything is written."""
+    """Render the first frame, so that errors that concern every frame are raised before anything is written."""
     reader = derivation.reader(source)
     frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
     for view in derivation.views.values():
@@ -238,14 +239,14 @@ def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
     if derivation.calibration is None:
         try:
             check_visible(
-                derivation.camera, frame.camera, derivation.workspace, "views will be empty where it sees nothing"
+                derivation.camera, frame.camera, derivation.workspace, "views will be empty outside its image"
             )
         except CalibrationError as error:
             logger.warning("%s", error)
 
 
 def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, Any]:
-    """What determines the result."""
+    """Return all settings that determine the result."""
     return plain(
         {
             "repo_id": config.target().repo_id,

@@ -1,4 +1,4 @@
-"""The page that describes a dataset on the Hub, written from what the dataset says of itself."""
+"""Dataset card for the Hub, generated from the dataset's metadata."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, is_depth_feature
 
-CARD, PICTURE = "README.md", "meta/symview_picture.png"
-SHOWN_FRAME = 2  # of the first episode: the gripper is on its way, the arm in the picture
-HEIGHT = 228  # pixels of the picture
+CARD, IMAGE = "README.md", "meta/symview_picture.png"
+SHOWN_FRAME = 2  # index in the first episode: the arm is in the image and the gripper moves
+HEIGHT = 228  # rows of the card's image
 TAGS = ("LeRobot", "symview", "robotics", "equivariance")
 REPOSITORY = "lerobot_symview"
 
 
 def write_card(folder: Path, repo_id: str, tags: list[str]) -> None:
-    """Write the card of the dataset in `folder`, and its picture."""
+    """Write the card of the dataset in `folder`, and its image."""
     dataset = SourceDataset(folder)
     shown = _colour_images(dataset)
     if shown:
-        cv2.imwrite(str(folder / PICTURE), cv2.cvtColor(np.concatenate(shown, axis=1), cv2.COLOR_RGB2BGR))
-    (folder / CARD).write_text(dataset_card(dataset, repo_id, tags, has_picture=bool(shown)))
+        cv2.imwrite(str(folder / IMAGE), cv2.cvtColor(np.concatenate(shown, axis=1), cv2.COLOR_RGB2BGR))
+    (folder / CARD).write_text(dataset_card(dataset, repo_id, tags, has_image=bool(shown)))
 
 
-def dataset_card(dataset: SourceDataset, repo_id: str, tags: list[str], has_picture: bool) -> str:
-    """Return the card: metadata as the Hub reads it, then Markdown."""
+def dataset_card(dataset: SourceDataset, repo_id: str, tags: list[str], has_image: bool) -> str:
+    """Return the card: YAML metadata for the Hub, then Markdown."""
     info = dataset.info
     facts = _facts(dataset)
     title = facts.get("task", repo_id.split("/")[1]).replace("_", " ")
     sections = [
         _metadata([*TAGS, *tags]),
-        f"# {title.capitalize()}, seen by freely placed cameras\n",
+        f"# {title.capitalize()}, recorded by freely placed cameras\n",
         f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz, LeRobot format "
         f"{info['codebase_version']}.{_recorded(facts)}\n",
-        f"![One moment]({PICTURE})\n" if has_picture else "",
-        "## Images\n\n| key | pixels | what |\n|---|---|---|",
+        f"![Images of one frame]({IMAGE})\n" if has_image else "",
+        "## Images\n\n| key | pixels | content |\n|---|---|---|",
         *(_image_row(key, feature) for key, feature in dataset.features.items() if _is_image(feature)),
         _calibration(dataset),
         "\n## State and action\n",
-        _entries(dataset, keys.STATE),
-        _entries(dataset, keys.ACTION),
+        _dimensions(dataset, keys.STATE),
+        _dimensions(dataset, keys.ACTION),
         "x and y are relative to the workspace's centre; lengths in metres, angles in radians, apertures in [0, 1].\n",
         _training(repo_id, dataset),
     ]
@@ -65,32 +65,32 @@ def _metadata(tags: list[str]) -> str:
 
 
 def _facts(dataset: SourceDataset) -> dict[str, Any]:
-    """Return what is known of the recording, from any of its images."""
-    found: dict[str, Any] = {}
+    """Return the task, robot and other settings of the recording, as stored with its images and in its metadata."""
+    facts: dict[str, Any] = {}
     for feature in dataset.features.values():
-        found |= (feature.get("info") or {}).get("symview", {})
+        facts |= (feature.get("info") or {}).get("symview", {})
     recording = dataset.folder / "meta" / "symview_recording.json"
     if recording.is_file():
         request = json.loads(recording.read_text())
-        found |= {"task": request["env"]["task"], "robot": request["env"]["robot"], "seed": request["seed"]}
-        found |= {"instruction": request["instruction"], "noise": request["noise"]}
-    return found
+        facts |= {"task": request["env"]["task"], "robot": request["env"]["robot"], "seed": request["seed"]}
+        facts |= {"instruction": request["instruction"], "noise": request["noise"]}
+    return facts
 
 
 def _recorded(facts: dict[str, Any]) -> str:
     if "task" not in facts:
         return ""
     sentences = [
-        f"A scripted expert does `{facts['task']}` with a {facts['robot']} arm in PyBullet, seed {facts['seed']}."
+        f"A scripted expert performs `{facts['task']}` with a {facts['robot']} arm in PyBullet, seed {facts['seed']}."
     ]
     if "instruction" in facts:
         sentences.append(f'The instruction is "{facts["instruction"]}"')
     if facts.get("noise"):
-        share = f"{facts['noise']:g} of the largest"
-        sentences.append(f"Its motions are disturbed by {share}; what is recorded is what it meant to do.")
+        deviation = f"a standard deviation of {facts['noise']:g} of the largest action"
+        sentences.append(f"Noise with {deviation} is added to its actions; the recorded actions are without noise.")
     if "expert_success_rate" in facts:
         rate = f"{100 * facts['expert_success_rate']:.1f} %"
-        sentences.append(f"It succeeded in {rate} of its attempts; only successes are here.")
+        sentences.append(f"It succeeded in {rate} of its attempts; the dataset holds the successful ones only.")
     return " " + " ".join(sentences)
 
 
@@ -102,11 +102,11 @@ def _image_row(key: str, feature: dict[str, Any]) -> str:
         options = ", ".join(f"{name}={value}" for name, value in symview["options"].items())
         text = f"view `{symview['view']}` made from camera `{symview['camera']}` ({options})"
     elif "placement" in symview:
-        place = symview["placement"]
-        angle, distance = f"{place['elevation_deg']:g} degrees", f"{place['distance']:g} m"
-        text = f"camera `{place['name']}`, {angle} above the table, {distance} away"
-        if any(place["spread"].values()):
-            text += ", elsewhere in every episode"
+        placement = symview["placement"]
+        angle, distance = f"{placement['elevation_deg']:g} degrees", f"{placement['distance']:g} m"
+        text = f"camera `{placement['name']}`, {angle} above the table, {distance} away"
+        if any(placement["spread"].values()):
+            text += ", randomised in every episode"
     else:
         text = "camera"
     measure = f", {'height' if 'view' in symview else 'depth'} in {unit}" if unit else ""
@@ -118,15 +118,15 @@ def _calibration(dataset: SourceDataset) -> str:
     if not known:
         return ""
     return (
-        "\nEvery frame has its cameras' calibration: `intrinsics`, K in pixels (9 numbers, row by row), and "
-        "`world_from_cam` (16 numbers, row by row), which maps points of the camera (x right, y down, z forward, "
-        "metres) to the world (z up, table at z = 0). Integer pixel coordinates are pixel centres; depth is in metres "
-        "along the optical axis, 0 where there is none. In views from above, rows grow with the world's x and columns "
-        "with y.\n"
+        "\nEvery frame has its cameras' calibration: `intrinsics`, K in pixels (9 numbers, row-major), and "
+        "`world_from_cam` (16 numbers, row-major), which maps camera coordinates (x right, y down, z forward, "
+        "metres) to world coordinates (z up, table at z = 0). Integer pixel coordinates are pixel centres; depth is in "
+        "metres along the optical axis, 0 where it is invalid. In top-down views, rows grow with the world's x and "
+        "columns with y.\n"
     )
 
 
-def _entries(dataset: SourceDataset, key: str) -> str:
+def _dimensions(dataset: SourceDataset, key: str) -> str:
     feature = dataset.features.get(key)
     if feature is None:
         return ""
@@ -136,12 +136,12 @@ def _entries(dataset: SourceDataset, key: str) -> str:
 
 def _training(repo_id: str, dataset: SourceDataset) -> str:
     views = [(feature.get("info") or {}).get("symview", {}).get("view") for feature in dataset.features.values()]
-    view = next((one for one in views if one), None)
+    view = next((name for name in views if name), None)
     method = f" --policy.method={view}_equi" if view else ""
     command = f"lerobot-train --dataset.repo_id={repo_id} --policy.type=symview_bc{method} --policy.push_to_hub=false"
     return (
         f"## Train on it\n\n```bash\n{command}\n```\n\n`symview_bc` is a policy of {REPOSITORY}, a plugin of LeRobot; "
-        "other policies read the dataset too.\n"
+        "other LeRobot policies can train on this dataset too.\n"
     )
 
 
@@ -150,8 +150,8 @@ def _is_image(feature: dict[str, Any]) -> bool:
 
 
 def _colour_images(dataset: SourceDataset) -> list[NDArray[np.uint8]]:
-    """Return a moment's colour images, all of one height."""
-    names = [key for key, one in dataset.features.items() if _is_image(one) and not is_depth_feature(one)]
+    """Return the colour images of one frame, resized to the same number of rows."""
+    names = [key for key, feature in dataset.features.items() if _is_image(feature) and not is_depth_feature(feature)]
     names = [key for key in names if not key.endswith(("_segmentation", "_gripper", "_seen"))]
     stored = [key for key in names if dataset.features[key]["dtype"] == "image"]
     reader = EpisodeTables(dataset, dataset.data_file(0), [*stored, "timestamp"])

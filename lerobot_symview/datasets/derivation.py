@@ -1,11 +1,11 @@
-"""A dataset derived from another: the same episodes with views added, made in parts by any number of processes.
+"""Derived datasets: the episodes of a source with views added, written in parts by any number of processes.
 
-    <target>.partial/request.json       what is made; a resumed run must ask for the same
-    <target>.partial/dataset/           the result; its tables' files are the parts, each complete or absent
-    <target>.partial/statistics/        of the new images, a part each
+    <target>.partial/request.json       settings of the result; a resumed run must have the same
+    <target>.partial/dataset/           the result; each table file is one part, complete or absent
+    <target>.partial/statistics/        statistics of the new images, one file per part
 
-A part is a range of neighbouring episodes. Which there are follows from the source alone, so that the result is the
-same whoever writes which part when.
+A part is a range of consecutive episodes. The parts depend on the source alone, so the result is the same for any
+number of processes and any order of parts.
 """
 
 from __future__ import annotations
@@ -33,46 +33,46 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.staging import disk_errors, part_of
 from lerobot_symview.views import View
 
-PART_FRAMES = 200  # at least, where a file of the source has as many
-MADE_FROM = "symview_views.json"  # in the result's `meta`
+PART_FRAMES = 200  # least frames of a part, unless its source file has fewer
+MADE_FROM = "symview_views.json"  # file in the result's `meta` with its settings
 
 
 @dataclass(frozen=True)
 class Derivation:
-    """What is derived from what; small enough to send to every worker."""
+    """Source, settings and schema of a derived dataset; small enough to send to every worker."""
 
     source: Path
-    """Folder of the dataset that is read."""
+    """Folder of the source dataset."""
     source_files: str
-    """Its fingerprint when the work began."""
+    """`source_fingerprint` of the source when the run started."""
     folder: Path
     """`<target>.partial`."""
     camera: str
-    """Whose images the views are made from."""
+    """Camera whose images the views are rendered from."""
     views: dict[str, View]
-    """What is added."""
+    """Views to add, by name."""
     workspace: Workspace
-    """What the views show."""
+    """Square on the table that the views show."""
     calibration: Calibration | None
-    """The camera's, where the dataset has none; it is added too."""
+    """Calibration of the camera if it is not in the source; it is added to the result."""
     dropped: list[str]
-    """Features of the source that are left out."""
+    """Keys of the source features that are not copied."""
     added: Features
-    """Features that are new."""
+    """Declarations of the new features."""
     schema: pa.Schema = field(repr=False)
-    """Of the result's tables."""
+    """Schema of the result's tables."""
 
     @property
     def dataset(self) -> Path:
-        """Where the result grows."""
+        """Folder of the unfinished result."""
         return self.folder / "dataset"
 
     def open_source(self) -> SourceDataset:
-        """Return the dataset that is read, whose metadata a process reads once."""
+        """Return the source dataset; its metadata is cached per process."""
         return _opened(self.source, self.source_files)
 
     def reader(self, source: SourceDataset) -> FrameReader:
-        """Return what puts the frames of `source` together."""
+        """Return a reader of the frames that the views are rendered from."""
         return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration)
 
     def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
@@ -84,19 +84,19 @@ class Derivation:
         }
 
     def no_statistics(self) -> dict[str, ImageStatistics]:
-        """Return the statistics of no image, for every new image feature."""
+        """Return empty statistics for every new image feature."""
         return {key: ImageStatistics.empty(kind) for key, kind in self.image_kinds().items()}
 
     def table_file(self, source: SourceDataset, part: int) -> Path:
-        """Where a part's table is in the result."""
+        """Return the file of a part's table in the result."""
         return self.dataset / source.data_path(*self.place(source, part))
 
     def place(self, source: SourceDataset, part: int) -> tuple[int, int]:
-        """Chunk and file of a part's table."""
+        """Return the chunk index and file index of a part's table."""
         return divmod(part, source.info["chunks_size"])
 
     def statistics_file(self, part: int) -> Path:
-        """Where the statistics of a part's new images are."""
+        """Return the file with the statistics of a part's new images."""
         return self.folder / "statistics" / f"{part:06d}.npz"
 
 
@@ -106,7 +106,7 @@ def _opened(folder: Path, _fingerprint: str) -> SourceDataset:
 
 
 def cut_parts(source: SourceDataset) -> list[range]:
-    """Return the episodes of every part: neighbours in one file, of 200 frames together or a few more."""
+    """Return the episodes of every part: consecutive, of one file, and 200 frames or more if the file has them."""
     parts: list[range] = []
     frames = 0
     for episode, row in enumerate(source.episodes):
@@ -120,13 +120,13 @@ def cut_parts(source: SourceDataset) -> list[range]:
 
 
 def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -> pa.Schema:
-    """Return the schema of the result's tables, with the declaration that Hugging Face's `datasets` reads."""
+    """Return the schema of the result's tables, with the metadata that Hugging Face's `datasets` reads."""
     from datasets import Features as TableFeatures
     from datasets import Image, List, Value
 
     features = dict(TableFeatures.from_arrow_schema(pq.read_schema(source.data_file(0))))
     for key in dropped:
-        features.pop(key, None)  # a video has no column
+        features.pop(key, None)  # videos have no column
     for key, feature in added.items():
         is_image = feature["dtype"] == "image"
         features[key] = Image() if is_image else List(Value(feature["dtype"]), length=feature["shape"][0])
@@ -134,7 +134,7 @@ def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -
 
 
 def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
-    """Write the table and the statistics of a part's episodes, unless they are there; return how many frames."""
+    """Write the table and statistics of a part unless they exist; return its number of frames."""
     index, episodes = part
     source = derivation.open_source()
     count = sum(source.episodes[episode]["length"] for episode in episodes)
@@ -147,7 +147,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     kept = [name for name in derivation.schema.names if name not in derivation.added]
     columns = list(dict.fromkeys([*kept, *reader.columns()]))
     tables = EpisodeTables(source, source.data_file(episodes.start), columns)
-    # Written outside the result, so that what a killed process leaves behind is not in it.
+    # Temporary files are outside the result, so that it contains none if a process is killed.
     table_part, statistics_part = (part_of(derivation.folder / file.name) for file in (table_file, statistics_file))
     with disk_errors(derivation.folder):
         try:
@@ -156,11 +156,11 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
                     table = tables.read(episode)
                     new, statistics = _render(derivation, reader, episode, table)
                     arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
-                    # a row group per episode, as LeRobot writes them
+                    # one row group per episode, as LeRobot writes them
                     writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
-                    for key, one in statistics.items():
-                        summaries[key].append(one.summary())
-                        merged[key].merge(one)
+                    for key, episode_statistics in statistics.items():
+                        summaries[key].append(episode_statistics.summary())
+                        merged[key].merge(episode_statistics)
             with statistics_part.open("wb") as stream:
                 np.savez_compressed(stream, **_packed(merged, summaries))
             for done, file in ((statistics_part, statistics_file), (table_part, table_file)):
@@ -175,7 +175,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
 def _render(
     derivation: Derivation, reader: FrameReader, episode: int, table: pa.Table
 ) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
-    """Return the new columns of an episode, and the statistics of its new images."""
+    """Render an episode; return its new columns and the statistics of its new images."""
     kinds, statistics = derivation.image_kinds(), derivation.no_statistics()
     encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
     for frame in reader.frames(episode, table):
@@ -194,13 +194,13 @@ def _render(
 
 
 def image_column(images: list[bytes], extension: str) -> pa.StructArray:
-    """Return encoded images as the column that Hugging Face's `datasets` reads, with file names like LeRobot's."""
+    """Return encoded images as an image column of Hugging Face's `datasets`, with LeRobot's file names."""
     names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
     return pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
 
 
 def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
-    """Return the calibration that the result gains, by feature."""
+    """Return the calibration matrices that are added to the result, flattened float32, by feature key."""
     if derivation.calibration is None:
         return {}
     camera = derivation.calibration.camera(derivation.camera)
@@ -210,14 +210,14 @@ def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
 
 def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
     packed: dict[str, Any] = {}
-    for key, one in merged.items():
-        packed |= {f"{key}/images": one.images, f"{key}/counts": one.counts, f"{key}/sums": one.sums}
+    for key, total in merged.items():
+        packed |= {f"{key}/images": total.images, f"{key}/counts": total.counts, f"{key}/sums": total.sums}
         packed[f"{key}/summaries"] = np.stack(summaries[key])
     return packed
 
 
 def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> Path:
-    """Complete the result, whose tables are all there, by videos and metadata, and return its folder."""
+    """Add videos and metadata to the result once all its tables are written; return its folder."""
     source = derivation.open_source()
     with disk_errors(derivation.folder):
         for key, feature in source.features.items():
@@ -246,7 +246,7 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
 def _collect_statistics(
     derivation: Derivation, source: SourceDataset, parts: list[range]
 ) -> tuple[dict[str, Any], dict[str, dict[str, list[Any]]]]:
-    """Return the statistics of every new feature over the dataset, and lists of them over each episode."""
+    """Return the statistics of every new feature over the dataset, and as lists with one entry per episode."""
     totals = derivation.no_statistics()
     summaries: dict[str, list[NDArray]] = {key: [] for key in totals}
     for part in range(len(parts)):
@@ -261,7 +261,7 @@ def _collect_statistics(
     for key, values in _added_vectors(derivation).items():
         collected[key] = constant_summary(values, sum(lengths))
         each = [constant_summary(values, length) for length in lengths]
-        of_episodes[key] = {name: [one[name] for one in each] for name in each[0]}
+        of_episodes[key] = {name: [summary[name] for summary in each] for name in each[0]}
     return collected, of_episodes
 
 
@@ -272,7 +272,7 @@ def _rewrite_episodes(
     parts: list[range],
     statistics: dict[str, dict[str, list[Any]]],
 ) -> None:
-    """Say where each episode's table is now, and add and drop statistics."""
+    """Update the table locations of a file of episode metadata, and its statistics."""
     table = pq.read_table(file).replace_schema_metadata(None)
     dropped = tuple(
         f"{place}/{key}/" for place in ("stats", "videos") for key in (*derivation.dropped, *derivation.added)
@@ -291,7 +291,7 @@ def _rewrite_episodes(
 
 
 def source_fingerprint(source: SourceDataset) -> str:
-    """Return what changes when the source's metadata or the size of any of its files does."""
+    """Return a hash of the source's `info.json` and of the names and sizes of all its files."""
     digest = hashlib.sha256((source.folder / "meta" / "info.json").read_bytes())
     for file in sorted(path for path in source.folder.rglob("*") if path.is_file()):
         digest.update(f"{file.relative_to(source.folder)} {file.stat().st_size}\n".encode())

@@ -1,4 +1,4 @@
-"""LeRobot feature declarations of what cameras and views yield."""
+"""LeRobot feature declarations of cameras and views."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ IMAGE_AXES = ["height", "width", "channels"]
 
 
 def color_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
-    """Declare an RGB image; `facts` are stored with it under `info["symview"]`."""
+    """Declare a uint8 RGB image; `facts` are stored under `info["symview"]`."""
     return {"dtype": "image", "shape": (height, width, 3), "names": IMAGE_AXES, "info": {"symview": facts}}
 
 
 def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
-    """Declare a float32 image in metres, stored losslessly."""
+    """Declare a float32 image in metres, stored losslessly; `facts` are stored under `info["symview"]`."""
     info = {"is_depth_map": True, "depth_unit": "m", "symview": facts}
     return {"dtype": "image", "shape": (height, width, 1), "names": IMAGE_AXES, "info": info}
 
@@ -31,7 +31,7 @@ def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, 
 def camera_features(
     name: str, height: int, width: int, facts: dict[str, Any], *, depth: bool = True, segmentation: bool = False
 ) -> Features:
-    """Declare colour and calibration of one camera, and its depth and segmentation where it has them."""
+    """Declare the colour image and calibration of one camera, and optionally its depth and segmentation."""
     features = {keys.rgb(name): color_feature(height, width, facts)}
     if depth:
         features[keys.depth(name)] = metric_feature(height, width, facts)
@@ -60,9 +60,9 @@ def calibration_features(name: str) -> Features:
 def view_features(
     camera: str, name: str, view: View, workspace: Workspace, calibration: dict[str, Any] | None = None
 ) -> Features:
-    """Declare the outputs of `view`, with everything needed to compute them again.
+    """Declare the outputs of `view`, with all parameters needed to render them again.
 
-    `calibration` is the content of the file that stated it; without one it is in the frames.
+    `calibration` is the content of a calibration file; None if the frames store the calibration.
     """
     facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
     if calibration is not None:
@@ -86,7 +86,7 @@ def declared_unit(feature: dict[str, Any]) -> Unit | None:
 
 
 def stored_workspace(features: Features) -> Workspace:
-    """Return the workspace a dataset was recorded in; the default one where it does not say."""
+    """Return the workspace that a dataset declares; the default workspace if it declares none."""
     from lerobot_symview.calibration.file import parse_workspace
 
     for key, feature in features.items():
@@ -95,5 +95,5 @@ def stored_workspace(features: Features) -> Workspace:
             try:
                 return parse_workspace(facts["workspace"])
             except CalibrationError as error:
-                raise CalibrationError(f"the workspace that {key} states: {error}") from None
+                raise CalibrationError(f"the workspace declared by {key}: {error}") from None
     return Workspace()

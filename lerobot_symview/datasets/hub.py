@@ -1,4 +1,4 @@
-"""Datasets to the Hugging Face Hub."""
+"""Uploads of datasets to the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ class HubDataset(HubOptions, DatasetLocation):
 
 
 def push_dataset(target: DatasetLocation, options: HubOptions) -> str:
-    """Upload a dataset with its card, and return its address. What is there already is not sent again.
+    """Upload a dataset with its card, and return its URL. Files that are already on the Hub are not sent again.
 
     Raises:
-        CommandError: if that fails; the dataset stays as it is.
+        CommandError: if the upload fails; the local dataset is not modified.
     """
     from huggingface_hub import DatasetCard, HfApi
     from huggingface_hub.errors import RevisionNotFoundError
 
-    from lerobot_symview.datasets.card import (  # simulators, which need no tables, read the options above
+    from lerobot_symview.datasets.card import (  # simulators use the options above without pyarrow
         CARD,
         write_card,
     )
@@ -62,7 +62,7 @@ def push_dataset(target: DatasetLocation, options: HubOptions) -> str:
             revision=options.branch,
             ignore_patterns=["*.part"],
         )
-        with suppress(RevisionNotFoundError):  # LeRobot loads the revision that is tagged with the format's version
+        with suppress(RevisionNotFoundError):  # LeRobot loads the revision tagged with the version of the format
             api.delete_tag(repo_id, tag=FORMAT, repo_type="dataset")
         api.create_tag(repo_id, tag=FORMAT, revision=options.branch, repo_type="dataset")
     logger.info("pushed to %s", address)
@@ -71,39 +71,40 @@ def push_dataset(target: DatasetLocation, options: HubOptions) -> str:
 
 @contextmanager
 def hub_errors(repo_id: str, flag: str, folder: Path) -> Iterator[None]:
-    """Say what went wrong with the Hub and what to do about it.
+    """Convert errors of the Hub client to errors that name the cause and the remedy.
 
     Args:
-        repo_id: what is uploaded there.
-        flag: which names it.
-        folder: from where.
+        repo_id: repository that is uploaded to.
+        flag: command-line flag that sets `repo_id`.
+        folder: local folder that is uploaded.
 
     Raises:
-        CommandError: in place of the Hub's errors.
+        CommandError: for every error of the client or the network.
     """
     import httpx
     from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError, OfflineModeIsEnabled
 
-    kept = f"Nothing is lost: {folder} is whole; the same command with --resume=true uploads it."
+    kept = f"Nothing is lost: {folder} is complete; the same command with --resume=true uploads it."
     try:
         yield
     except OfflineModeIsEnabled:
-        raise CommandError(f"HF_HUB_OFFLINE=1 keeps {repo_id} from the Hub: unset it. {kept}") from None
+        raise CommandError(f"HF_HUB_OFFLINE=1 blocks the upload of {repo_id} to the Hub: unset it. {kept}") from None
     except LocalTokenNotFoundError:
-        raise CommandError(f"no token for the Hub: run `hf auth login`, or set HF_TOKEN. {kept}") from None
+        raise CommandError(f"no token for the Hub found: run `hf auth login`, or set HF_TOKEN. {kept}") from None
     except HfHubHTTPError as error:
         status = error.response.status_code
         reasons = {
-            401: "the Hub does not know the token: run `hf auth login` again, or set HF_TOKEN",
-            403: f"the token must not write to {repo_id}: name a {flag} of yours, or use a token that may",
+            401: "the Hub rejects the token: run `hf auth login` again, or set HF_TOKEN",
+            403: f"the token has no write access to {repo_id}: "
+            f"set {flag} to a repository of yours, or use a token with write access",
         }
-        raise CommandError(f"{reasons.get(status, f'the Hub answers {status}: {error}')}. {kept}") from None
+        raise CommandError(f"{reasons.get(status, f'the Hub returned status {status}: {error}')}. {kept}") from None
     except (httpx.HTTPError, OSError) as error:
         raise CommandError(f"the Hub cannot be reached ({type(error).__name__}: {error}): try again. {kept}") from None
-    except RuntimeError as error:  # in which the client wraps what ends the upload of a file
+    except RuntimeError as error:  # the client wraps errors of single files in a RuntimeError
         if not isinstance(error.__cause__, (httpx.HTTPError, OSError)):
             raise
         reason = f"{error} {type(error.__cause__).__name__}: {error.__cause__}"
         raise CommandError(
-            f"the upload broke off ({reason}): try again, what arrived is not sent twice. {kept}"
+            f"the upload was interrupted ({reason}): try again, uploaded files are not sent again. {kept}"
         ) from None

@@ -1,4 +1,4 @@
-"""How a LeRobot dataset keeps images in its tables: PNG for colour, TIFF for metres, both without loss."""
+"""Encoding of images in LeRobot tables: PNG for colour, TIFF for float32 metres, both lossless."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-PNG_LEVEL = 1  # LeRobot's own: level 6 takes seven times as long for a tenth less
-PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # its first bytes; width and height follow
-TIFF, TIFF_WIDTH, TIFF_HEIGHT = {b"II*\0": "<", b"MM\0*": ">"}, 256, 257  # byte orders; tags
+PNG_LEVEL = 1  # as in LeRobot: level 6 takes seven times as long for files a tenth smaller
+PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"  # first bytes of a file; width and height follow
+TIFF, TIFF_WIDTH, TIFF_HEIGHT = {b"II*\0": "<", b"MM\0*": ">"}, 256, 257  # signature -> byte order; tags
 TIFF_TYPES = {3: "H", 4: "I"}
-NO_COMPRESSION = 1  # TIFF's code for none
+NO_COMPRESSION = 1  # TIFF's code
 
 
 def encoded_size(data: Buffer) -> tuple[int, int]:
-    """Return height and width that an encoded image states, without decoding it.
+    """Return height and width from the header of an encoded image, without decoding it.
 
     Raises:
-        ValueError: if `data` is no image.
+        ValueError: if `data` is not an image.
     """
     head = bytes(memoryview(data)[:24])
-    if head.startswith(PNG) and len(head) == 24:  # nearly all images are PNG or TIFF; PIL takes longer than decoding
+    if head.startswith(PNG) and len(head) == 24:  # fast path: PIL takes longer than decoding
         width, height = struct.unpack(">II", head[16:])
         return height, width
     if head[:4] in TIFF:
@@ -37,11 +37,11 @@ def encoded_size(data: Buffer) -> tuple[int, int]:
         with Image.open(io.BytesIO(data)) as image:
             return image.height, image.width
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f"{len(memoryview(data))} bytes that are no image: {error}") from None
+        raise ValueError(f"expected an image, got {len(memoryview(data))} bytes that are no image: {error}") from None
 
 
 def _tiff_size(data: memoryview, order: str) -> tuple[int, int]:
-    """Return height and width from the first directory, whose entries have 12 bytes: tag, type, count, value."""
+    """Return height and width from the first directory; its entries have 12 bytes: tag, type, count, value."""
     (start,) = struct.unpack_from(f"{order}I", data, 4)
     (count,) = struct.unpack_from(f"{order}H", data, start)
     values = {}
@@ -55,19 +55,19 @@ def _tiff_size(data: memoryview, order: str) -> tuple[int, int]:
 
 
 def decode_rgb(data: Buffer) -> NDArray[np.uint8]:
-    """Return (H, W, 3) uint8 of an encoded colour image.
+    """Decode a colour image to (H, W, 3) uint8 RGB.
 
     Raises:
-        ValueError: if `data` is no image.
+        ValueError: if `data` is not an image.
     """
     return np.asarray(_decode(data, cv2.IMREAD_COLOR_RGB), dtype=np.uint8)
 
 
 def decode_depth(data: Buffer) -> NDArray:
-    """Return (H, W) float32 or uint16, whatever was encoded.
+    """Decode a depth image to (H, W), float32 or uint16 as encoded.
 
     Raises:
-        ValueError: if `data` is no image of one channel.
+        ValueError: if `data` is not a one-channel image.
     """
     image = _decode(data, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
@@ -76,19 +76,19 @@ def decode_depth(data: Buffer) -> NDArray:
 
 
 def encode_rgb(image: NDArray[np.uint8]) -> bytes:
-    """Return (H, W, 3) uint8 as PNG."""
+    """Encode an (H, W, 3) uint8 RGB image as PNG."""
     return _encode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
 
 
 def encode_metres(image: NDArray[np.float32]) -> bytes:
-    """Return (H, W) float32 as TIFF."""
+    """Encode an (H, W) float32 image as uncompressed TIFF."""
     return _encode(".tiff", image, [cv2.IMWRITE_TIFF_COMPRESSION, NO_COMPRESSION])
 
 
 def _decode(data: Buffer, flags: int) -> NDArray:
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     if image is None:
-        raise ValueError(f"{memoryview(data).nbytes} bytes that are no image OpenCV can read")
+        raise ValueError(f"expected an image, got {memoryview(data).nbytes} bytes that are no image OpenCV can read")
     return image
 
 

@@ -1,4 +1,4 @@
-"""Statistics over all pixels of many images, from histograms: nothing is sampled, and parts can be added up."""
+"""Statistics over all pixels of many images, from histograms that can be merged; no pixels are subsampled."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from numpy.typing import NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 SUMMARY = ("min", "max", "mean", "std", *QUANTILES)
-LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: what lies outside counts, for quantiles, as lying at the border
+LOWEST, HIGHEST, STEP = -0.5, 1.5, 1e-4  # metres: values outside count in the border bins, for quantiles
 PER_METRE = round(1 / STEP)
 LEVELS = LOWEST + STEP * np.arange(round((HIGHEST - LOWEST) / STEP) + 1)
 
 
 @dataclass(eq=False)
 class ImageStatistics:
-    """What is known of the images seen so far.
+    """Histograms and moments of a set of images.
 
-    Colour's quantiles are exact; those of metres are multiples of 0.1 mm. Everything else is exact up to rounding.
+    Quantiles of colours are exact; quantiles of heights are multiples of 0.1 mm. All other values are exact up to
+    rounding.
 
     Args:
-        kind: `rgb` for (H, W, 3) uint8, counted in levels of 1/255 as LeRobot does, or `height` for (H, W) float32.
-        images: how many.
-        counts: (C, bins) int64, pixels per level.
+        kind: `rgb` for (H, W, 3) uint8, with levels of 1/255 as in LeRobot, or `height` for (H, W) float32, metres.
+        images: number of images.
+        counts: (C, bins) int64, pixels per bin.
         sums: (C, 4) float64: minimum, maximum, sum and sum of squares.
     """
 
@@ -36,21 +37,21 @@ class ImageStatistics:
 
     @classmethod
     def empty(cls, kind: Literal["rgb", "height"]) -> Self:
-        """Return the statistics of no image."""
+        """Return the statistics of an empty set of images."""
         channels, bins = (3, 256) if kind == "rgb" else (1, len(LEVELS))
         sums = np.tile([np.inf, -np.inf, 0.0, 0.0], (channels, 1))
         return cls(kind, 0, np.zeros((channels, bins), dtype=np.int64), sums)
 
     def add(self, image: NDArray) -> None:
-        """Count one image."""
+        """Add one image."""
         self.images += 1
         if self.kind == "rgb":
-            _count_levels(image, self.counts)  # from which the rest follows
+            _count_levels(image, self.counts)  # minimum, maximum and moments follow from the counts
         else:
             _count_metres(image, self.counts[0], self.sums[0])
 
     def merge(self, other: Self) -> None:
-        """Count what `other` has counted."""
+        """Add the images of `other`."""
         self.images += other.images
         self.counts += other.counts
         self.sums[:, 0] = np.minimum(self.sums[:, 0], other.sums[:, 0])
@@ -58,12 +59,12 @@ class ImageStatistics:
         self.sums[:, 2:] += other.sums[:, 2:]
 
     def summary(self) -> NDArray[np.float64]:
-        """Return what `SUMMARY` names of every channel: (9, C) float64."""
+        """Return the statistics named in `SUMMARY` per channel: (9, C) float64."""
         total = self.counts.sum(axis=1)
         if self.kind == "rgb":
             levels: NDArray = np.arange(256) / 255
-            seen = self.counts > 0
-            minimum, maximum = levels[seen.argmax(axis=1)], levels[255 - seen[:, ::-1].argmax(axis=1)]
+            occupied = self.counts > 0
+            minimum, maximum = levels[occupied.argmax(axis=1)], levels[255 - occupied[:, ::-1].argmax(axis=1)]
             mean = self.counts @ levels / total
             variance = self.counts @ levels**2 / total - mean**2
         else:
@@ -77,14 +78,14 @@ class ImageStatistics:
 
 
 def image_summary(summary: NDArray[np.float64], images: Any) -> dict[str, Any]:
-    """Return LeRobot's statistics of image features, from one summary or from many.
+    """Return one or more summaries as LeRobot's statistics of image features.
 
     Args:
-        summary: (..., 9, C), by `ImageStatistics.summary`.
-        images: (...) how many images each is of.
+        summary: (..., 9, C), from `ImageStatistics.summary`.
+        images: (...), number of images of each summary.
 
     Returns:
-        Lists of shape (..., C, 1, 1), and of shape (..., 1) the number of images.
+        Lists of shape (..., C, 1, 1) by name, and `count` of shape (..., 1).
     """
     values = np.moveaxis(summary, -2, 0)[..., None, None]
     named = {name: value.tolist() for name, value in zip(SUMMARY, values, strict=True)}
@@ -92,14 +93,14 @@ def image_summary(summary: NDArray[np.float64], images: Any) -> dict[str, Any]:
 
 
 def constant_summary(values: NDArray[np.floating], count: int) -> dict[str, Any]:
-    """Return LeRobot's statistics of a feature that is `values` (N,) in each of `count` frames."""
+    """Return LeRobot's statistics of a feature with the constant `values` (N,) in `count` frames."""
     same = {name: values.tolist() for name in ("min", "max", "mean", *QUANTILES)}
     return same | {"std": np.zeros_like(values).tolist(), "count": [count]}
 
 
 @njit(cache=True, nogil=True)
 def _bins(counts, ranks):  # type: ignore[no-untyped-def]
-    """Return in which bin of counts (C, bins) each of the ranks (N, C), ascending and from 1, lies: (N, C)."""
+    """Return the bin of counts (C, bins) that holds each of the ranks (N, C), ascending from 1: (N, C) int64."""
     bins = np.empty(ranks.shape, np.int64)
     for channel in range(len(counts)):
         reached, level = counts[channel, 0], 0

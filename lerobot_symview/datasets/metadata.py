@@ -1,4 +1,4 @@
-"""`meta/info.json` of a LeRobot dataset, checked where it is read: it leads nowhere else and declares what can be."""
+"""Reading and validation of a LeRobot dataset's `meta/info.json`: paths stay in the dataset, sizes are bounded."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any
 
 from lerobot_symview.errors import DatasetError
 
-FORMAT = "v3.0"  # LeRobot's
-MOST_PIXELS = 2**26  # of an image
-COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # at least
+FORMAT = "v3.0"  # LeRobot's dataset format
+MOST_PIXELS = 2**26  # largest size of an image
+COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # least values
 NUMBERS = r"\{(?:chunk|file)_index(?::0[1-9]d)?\}"
 TEMPLATES = {"data_path": NUMBERS, "video_path": rf"{NUMBERS}|\{{video_key\}}"}
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """Return what the `meta/info.json` of a dataset says.
+    """Return the validated content of a dataset's `meta/info.json`.
 
     Raises:
-        DatasetError: if there is none, one of another format, or all that is wrong with it.
+        DatasetError: if the file is missing, has another format or is invalid; one message lists all problems.
     """
     file = folder / "meta" / "info.json"
     if not file.is_file():
@@ -44,11 +44,11 @@ def read_info(folder: Path) -> dict[str, Any]:
 def _problems(info: dict[str, Any]) -> Iterator[str]:
     for name, least in COUNTS.items():
         if not is_count(info.get(name), least):
-            yield f"{name} must be a number of at least {least}, got {info.get(name)!r}"
+            yield f"{name} must be an integer of at least {least}, got {info.get(name)!r}"
     for name, fields in TEMPLATES.items():
-        stated = info.get(name)
-        if (name == "data_path" or stated is not None) and not _stays_inside(stated, fields):
-            yield f"{name} must be a path in the dataset, such as LeRobot's own, got {str(stated)[:200]!r}"
+        template = info.get(name)
+        if (name == "data_path" or template is not None) and not _stays_inside(template, fields):
+            yield f"{name} must be a relative path in the dataset, such as LeRobot's own, got {str(template)[:200]!r}"
     features = info.get("features")
     if not isinstance(features, dict):
         yield f"features must be an object, got {type(features).__name__}"
@@ -58,14 +58,14 @@ def _problems(info: dict[str, Any]) -> Iterator[str]:
 
 
 def _feature_problems(key: str, feature: Any) -> Iterator[str]:
-    if not re.fullmatch(r"[^./\\\0][^/\\\0]*", key):  # names folders of videos
-        yield "has a name that can be a path"
+    if not re.fullmatch(r"[^./\\\0][^/\\\0]*", key):  # video folders are named by the key
+        yield "has a name that is not safe as a folder name"
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         yield "must be an object with a dtype"
         return
     facts = feature.get("info") or {}
     if not isinstance(facts, dict) or not isinstance(facts.get("symview", {}), dict):
-        yield "has an info that is no object"
+        yield "has an info that is not an object"
     shape = feature.get("shape")
     if feature["dtype"] in ("image", "video") and (
         not isinstance(shape, list)
@@ -73,7 +73,7 @@ def _feature_problems(key: str, feature: Any) -> Iterator[str]:
         or not all(is_count(side, 1) for side in shape)
         or pixels(shape) > MOST_PIXELS
     ):
-        yield f"must have a shape of three numbers and at most {MOST_PIXELS} pixels, got {shape!r}"
+        yield f"must have a shape of three positive integers and at most {MOST_PIXELS} pixels, got {shape!r}"
 
 
 def is_count(value: Any, least: int) -> bool:
@@ -82,7 +82,7 @@ def is_count(value: Any, least: int) -> bool:
 
 
 def pixels(shape: list[int]) -> int:
-    """Return how many pixels an image of a declared shape has, whether its channels come first or last."""
+    """Return the number of pixels of a declared image shape, channels first or last."""
     _, *sides = sorted(shape)
     return sides[0] * sides[1]
 

@@ -1,7 +1,7 @@
-"""A LeRobot dataset on disk, read episode by episode, and the frames that views are made from.
+"""Reader of a LeRobot dataset on disk, by episode, and of the frames that views are rendered from.
 
-Depth is float32 metres behind this module, whatever unit the dataset stores. Tables are read with pyarrow: LeRobot,
-which takes seconds to import, is needed for videos alone.
+This module returns depth in float32 metres for any stored unit. Tables are read with pyarrow; LeRobot, which takes
+seconds to import, is used for videos only.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from lerobot_symview.views import Frame, View
 
 logger = logging.getLogger(__name__)
 
-ROW_BYTES = 2**20  # of a table at most, beside its images
-VIDEO_FRAMES = 64  # decoded at a time
-VIDEO_TOLERANCE = 1e-4  # seconds, LeRobot's own
+ROW_BYTES = 2**20  # largest size of a table's row, without its images
+VIDEO_FRAMES = 64  # frames decoded per batch
+VIDEO_TOLERANCE = 1e-4  # seconds, as in LeRobot
 
 
 class SourceDataset:
     """A LeRobot dataset in a folder.
 
     Args:
-        folder: where it is.
+        folder: the dataset's root.
 
     Raises:
-        DatasetError: if there is none, or one of another format.
+        DatasetError: if the dataset is missing, has another format or is malformed.
     """
 
     def __init__(self, folder: Path):
@@ -55,12 +55,12 @@ class SourceDataset:
 
     @property
     def features(self) -> Features:
-        """What it holds, as `meta/info.json` says."""
+        """Feature declarations from `meta/info.json`."""
         return self.info["features"]
 
     @cached_property
     def episodes(self) -> list[dict[str, Any]]:
-        """What `meta/episodes` says of every episode, in order, without its statistics."""
+        """Metadata of every episode from `meta/episodes`, in order, without statistics."""
         files = sorted((self.folder / "meta" / "episodes").rglob("*.parquet"))
         count = sum(pq.read_metadata(file).num_rows for file in files)
         if count != self.info["total_episodes"]:
@@ -76,7 +76,7 @@ class SourceDataset:
         return rows
 
     def _check_episodes(self, rows: list[dict[str, Any]]) -> None:
-        """Raise a DatasetError unless each row follows the one before, in whole numbers, within all frames."""
+        """Raise a DatasetError unless the rows are consecutive episodes with integer indices within `total_frames`."""
         frames, end = self.info["total_frames"], 0
         for index, row in enumerate(rows):
             bounds = {
@@ -93,25 +93,25 @@ class SourceDataset:
                     upper = "" if most is None else f" to {most}"
                     raise DatasetError(
                         f"{self.folder / 'meta' / 'episodes'}: episode {index} has {name} {value!r}, "
-                        f"expected a whole number from {least}{upper}"
+                        f"expected an integer from {least}{upper}"
                     )
             end = row["dataset_from_index"] + row["length"]
 
     def data_file(self, episode: int) -> Path:
-        """Where an episode's table is."""
+        """Return the file of an episode's table."""
         return self.folder / self.data_path(*self.data_place(episode))
 
     def data_place(self, episode: int) -> tuple[int, int]:
-        """Chunk and file of an episode's table."""
+        """Return the chunk index and file index of an episode's table."""
         row = self.episodes[episode]
         return row["data/chunk_index"], row["data/file_index"]
 
     def data_path(self, chunk: int, file: int) -> str:
-        """Path of a table, relative to the dataset."""
+        """Return the path of a table, relative to the dataset."""
         return self.info["data_path"].format(chunk_index=chunk, file_index=file)
 
     def first_row(self, episode: int) -> int:
-        """Where an episode begins in its table's file."""
+        """Return the index of an episode's first row in its table file."""
         return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_place(episode)]
 
     @cached_property
@@ -122,19 +122,19 @@ class SourceDataset:
         return starts
 
     def video_file(self, key: str, episode: int) -> Path:
-        """Where an episode's images of a video feature are.
+        """Return the video file of an episode and a video feature.
 
         Raises:
-            DatasetError: if the dataset does not say.
+            DatasetError: if the metadata lacks the location.
         """
         row, template = self.episodes[episode], self.info["video_path"]
         places = {part: row.get(f"videos/{key}/{part}") for part in ("chunk_index", "file_index")}
         if template is None or None in places.values():
-            raise DatasetError(f"{self.folder / 'meta'} does not say in which video episode {episode} of {key} is")
+            raise DatasetError(f"{self.folder / 'meta'} lacks the location of the video of {key} in episode {episode}")
         return self.folder / template.format(video_key=key, **places)
 
     def check_files(self, features: Collection[str]) -> None:
-        """Raise a DatasetError that names the files which `features` of every episode need and which are not there."""
+        """Raise a DatasetError that lists missing files of the given features, over all episodes."""
         videos = [key for key in features if self.features[key]["dtype"] == "video"]
         files = {self.folder / "meta" / "stats.json": None}
         files |= {self.folder / self.data_path(*place): None for place in self._file_starts}
@@ -151,9 +151,9 @@ class SourceDataset:
         """Decode an image or video feature: (H, W, 3) uint8 colour, or (H, W) float32 depth or height, metres.
 
         Args:
-            key: the feature.
-            episode: which episode.
-            table: rows of it; the images are those of these rows.
+            key: key of the feature.
+            episode: index of the episode.
+            table: rows of the episode; one image is decoded per row.
         """
         feature = self.features[key]
         if feature["dtype"] == "video":
@@ -163,7 +163,7 @@ class SourceDataset:
         for index, image in enumerate(encoded):
             data = image.as_buffer()
             if data is None:
-                raise ValueError(f"{key}: expected an image in the table, got none, and the path {paths[index]}")
+                raise ValueError(f"{key}: expected an image in the table, got none; its path is {paths[index]}")
             yield self.decode(key, data)
 
     def decode(self, key: str, data: Buffer) -> NDArray:
@@ -175,10 +175,10 @@ class SourceDataset:
         return in_metres(decode_depth(data), self.depth_unit(key)).astype(np.float32, copy=False)
 
     def depth_unit(self, key: str) -> Unit:
-        """Return the unit in which a depth or height feature is stored.
+        """Return the unit of a stored depth or height feature.
 
-        It is the unit that the feature declares (`info["depth_unit"]`). Without one it is inferred from the first
-        image with a valid pixel, and logged.
+        This is the declared unit (`info["depth_unit"]`). An undeclared unit is inferred from the first image with a
+        valid pixel, and logged.
         """
         if key not in self._units:
             self._units[key] = declared_unit(self.features[key]) or self._inferred_unit(key)
@@ -199,7 +199,7 @@ class SourceDataset:
         shape = self.features[key]["shape"]
         if height * width > pixels(shape):
             declared = " x ".join(map(str, shape))
-            raise ValueError(f"{key}: an image of {height} x {width} pixels, the dataset declares {declared}")
+            raise ValueError(f"{key}: an image has {height} x {width} pixels, the dataset declares {declared}")
 
     def _video_frames(self, key: str, episode: int, timestamps: NDArray[np.floating]) -> Iterator[NDArray]:
         import av
@@ -215,11 +215,14 @@ class SourceDataset:
             rate = float(stream.average_rate)
         is_depth = is_depth_feature(self.features[key])
         for first in range(0, len(timestamps), VIDEO_FRAMES):
-            moments = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
-            between = (max(moments) - min(moments)) * rate
+            seconds = (row[f"videos/{key}/from_timestamp"] + timestamps[first : first + VIDEO_FRAMES]).tolist()
+            between = (max(seconds) - min(seconds)) * rate
             if not between < 2 * VIDEO_FRAMES:
-                raise DatasetError(f"{file}: {len(moments)} frames of {key} lie {between:.0f} frames of video apart")
-            images = decode_video_frames(file, moments, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
+                raise DatasetError(
+                    f"{file}: {len(seconds)} frames of {key} span {between:.0f} video frames, "
+                    f"expected less than {2 * VIDEO_FRAMES}"
+                )
+            images = decode_video_frames(file, seconds, VIDEO_TOLERANCE, "pyav", return_uint8=True, is_depth=is_depth)
             if is_depth:
                 coding = DepthEncoderConfig.from_video_info(info)
                 images = dequantize_depth(
@@ -231,12 +234,15 @@ class SourceDataset:
 
 
 class EpisodeTables:
-    """Reads the rows of single episodes from one of a dataset's files, however its row groups are cut.
+    """Reader of single episodes from a table file with row groups of any size.
 
     Args:
         dataset: the dataset.
-        file: one of its tables' files.
-        columns: which columns; by default all.
+        file: one of its table files.
+        columns: columns to read; by default all.
+
+    Raises:
+        DatasetError: if the rows are larger than their images can require.
     """
 
     def __init__(self, dataset: SourceDataset, file: Path, columns: list[str] | None = None):
@@ -254,7 +260,11 @@ class EpisodeTables:
         self._starts = np.cumsum([0, *counts])
 
     def read(self, episode: int) -> pa.Table:
-        """Return an episode's rows."""
+        """Return the rows of an episode.
+
+        Raises:
+            DatasetError: if the file lacks them.
+        """
         first = self._dataset.first_row(episode)
         count = self._dataset.episodes[episode]["length"]
         if not 0 <= first <= self._starts[-1] - count:
@@ -270,14 +280,14 @@ class EpisodeTables:
 
 @dataclass(frozen=True)
 class FrameReader:
-    """Assembles the frames of one camera.
+    """Reader of one camera's frames.
 
     Args:
         dataset: the dataset.
         camera: name of the camera.
         workspace: the square on the table that views show.
-        views: the views to render, which decide what a frame must hold.
-        calibration: of the camera, where the dataset has none.
+        views: the views to render; they determine whether depth and the gripper's state are read.
+        calibration: calibration of the camera if it is not in the dataset.
     """
 
     dataset: SourceDataset
@@ -288,30 +298,30 @@ class FrameReader:
 
     @property
     def depth(self) -> bool:
-        """Whether depth is wanted."""
+        """Whether a view needs depth."""
         return any(view.needs_depth for view in self.views)
 
     @property
     def gripper(self) -> bool:
-        """Whether the gripper's state is wanted and the dataset has it."""
+        """Whether a view uses the gripper's state and the dataset has it."""
         return any(view.uses_gripper for view in self.views) and gripper_dimensions(self.dataset.features) is not None
 
     def features(self) -> list[str]:
-        """Return the features that `frames` reads, whether the dataset has them or not."""
-        wanted = [keys.rgb(self.camera), "timestamp"]
-        wanted += [keys.depth(self.camera)] if self.depth else []
-        wanted += [keys.STATE] if self.gripper else []
+        """Return the keys of the features that `frames` requires."""
+        required = [keys.rgb(self.camera), "timestamp"]
+        required += [keys.depth(self.camera)] if self.depth else []
+        required += [keys.STATE] if self.gripper else []
         if self.calibration is None:
-            wanted += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
-        return wanted
+            required += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+        return required
 
     def columns(self) -> list[str]:
-        """Return the columns of the tables that `frames` reads; what is video is not among them."""
+        """Return the table columns that `frames` reads: its features except videos."""
         features = self.dataset.features
         return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
 
     def check(self) -> None:
-        """Raise a DatasetError that names the features that are wanted and missing."""
+        """Raise a DatasetError that lists the required features that the dataset lacks."""
         features = self.dataset.features
         missing = [key for key in self.columns() if key not in features]
         depth = keys.depth(self.camera)
@@ -324,10 +334,10 @@ class FrameReader:
             )
 
     def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
-        """Yield the frames of an episode, whose rows `table` holds.
+        """Yield the frames of an episode; `table` holds its rows.
 
         Raises:
-            CalibrationError: if a frame's calibration is none.
+            CalibrationError: if a frame's calibration is invalid.
         """
         colors = self.dataset.images(keys.rgb(self.camera), episode, table)
         depths = self.dataset.images(keys.depth(self.camera), episode, table) if self.depth else repeat(None)
@@ -338,10 +348,10 @@ class FrameReader:
         if self.calibration is None:
             stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
             matrices = zip(*stored, strict=True)
-        moments = zip(colors, depths, states, matrices, strict=False)
-        for index, (rgb, depth, state, stated) in enumerate(islice(moments, len(table))):
+        steps = zip(colors, depths, states, matrices, strict=False)
+        for index, (rgb, depth, state, stored_matrices) in enumerate(islice(steps, len(table))):
             try:
-                camera = self._camera(stated, *rgb.shape[:2])
+                camera = self._camera(stored_matrices, *rgb.shape[:2])
             except CalibrationError as error:
                 raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
             yield Frame(rgb, depth, camera, self.workspace, state)
@@ -359,12 +369,12 @@ class FrameReader:
 
 
 def is_depth_feature(feature: dict[str, Any]) -> bool:
-    """Whether a feature holds distances rather than colour."""
+    """Whether a feature declares depth or height images."""
     return bool((feature.get("info") or {}).get("is_depth_map"))
 
 
 def gripper_dimensions(features: Features) -> list[int] | None:
-    """Return the indices of the gripper's x, y, z, yaw and aperture in the state; None if the state lacks one."""
+    """Return the indices of the gripper's x, y, z, yaw and aperture in the state; None if any is missing."""
     names = features.get(keys.STATE, {}).get("names")
     if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
         return None
@@ -372,5 +382,5 @@ def gripper_dimensions(features: Features) -> list[int] | None:
 
 
 def vectors(table: pa.Table, column: str) -> NDArray:
-    """Return a column of equally long lists as an array (rows, length)."""
+    """Return a column of lists of equal length as an array (rows, length)."""
     return table[column].combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(len(table), -1)

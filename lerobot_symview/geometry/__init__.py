@@ -1,1 +1,1 @@
-"""Cameras, workspaces and the geometry of views: pure functions on NumPy arrays."""
+"""Camera models, the workspace and view geometry: pure functions on NumPy arrays."""

@@ -27,7 +27,7 @@ class Camera:
         width: image columns.
 
     Raises:
-        CalibrationError: all that is wrong with the matrices, in one message.
+        CalibrationError: if the matrices are invalid; one message lists all problems.
     """
 
     intrinsics: Array
@@ -66,7 +66,7 @@ class Camera:
 
     @property
     def position(self) -> Array:
-        """(3,) the optical centre in the world."""
+        """(3,) optical centre in the world frame, metres."""
         return self.world_from_cam[:3, 3]
 
     @property
@@ -75,14 +75,14 @@ class Camera:
         return invert_rigid(self.world_from_cam)
 
     def enlarged(self, factor: int) -> Camera:
-        """Return the camera that sees the same with `factor` times the rows and columns."""
+        """Return the camera with the same field of view and `factor` times the rows and columns."""
         intrinsics = self.intrinsics * [[factor], [factor], [1]]
         intrinsics[:2, 2] += (factor - 1) / 2  # integer coordinates are pixel centres
         return Camera(intrinsics, self.world_from_cam, factor * self.height, factor * self.width)
 
 
 def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, width: int) -> Camera:
-    """Return the camera whose matrices a dataset or an observation holds.
+    """Return the camera with the matrices stored in a dataset or an observation.
 
     Args:
         intrinsics: (9,) or (3, 3), K in pixels.
@@ -91,10 +91,10 @@ def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, wid
         width: image columns.
 
     Returns:
-        The same object for the same numbers, so that what depends on the camera alone can be kept with it.
+        The same object for equal arguments, so that results that depend on the camera alone can be cached.
 
     Raises:
-        CalibrationError: as `Camera`.
+        CalibrationError: if the matrices are invalid, as for `Camera`.
     """
     matrices = (np.asarray(matrix, dtype=np.float64).tobytes() for matrix in (intrinsics, world_from_cam))
     return _camera(*matrices, height, width)
@@ -106,7 +106,7 @@ def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int) -
 
 
 def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:
-    """List every reason why the matrices are not a pinhole camera's; empty when they are."""
+    """Return all problems of the matrices of a pinhole camera; empty if they are valid."""
     if intrinsics.shape != (3, 3):
         return [f"intrinsics must have shape (3, 3), got {intrinsics.shape}"]
     if world_from_cam.shape != (4, 4):
@@ -133,7 +133,7 @@ def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, 
 
 
 def intrinsics_from_fov(fov: float, height: int, width: int) -> Array:
-    """Return K (3, 3) of a centred pinhole whose vertical field of view is `fov` radians.
+    """Return K (3, 3) of a centred pinhole camera with a vertical field of view of `fov` radians.
 
     The image spans pixel edges -0.5 to height - 0.5, so the principal point is ((width - 1)/2, (height - 1)/2).
     """
@@ -144,16 +144,16 @@ def intrinsics_from_fov(fov: float, height: int, width: int) -> Array:
 
 
 def orbit_pose(elevation: float, azimuth: float, distance: float, target: ArrayLike) -> Array:
-    """Return world_from_cam (4, 4) of a camera that looks at `target` from a sphere around it, image top upwards.
+    """Return world_from_cam (4, 4) of a camera on a sphere around `target` that looks at it, without roll.
 
     Args:
         elevation: radians above the horizontal plane; pi/2 looks straight down.
-        azimuth: radians about world z; 0 stands on the +x side of the target, pi/2 on the +y side.
+        azimuth: radians about world z; 0 is on the +x side of the target, pi/2 on the +y side.
         distance: metres, positive.
         target: (3,) world point, metres.
 
-    The axes are written out rather than built from an up vector, so straight down is not a special case: at
-    elevation pi/2 and azimuth 0 rows grow with +x and columns with +y.
+    The axes are computed in closed form rather than from an up vector, so looking straight down is not a special case:
+    at elevation pi/2 and azimuth 0, rows grow with +x and columns with +y.
     """
     if distance <= 0:
         raise CalibrationError(f"camera distance must be positive, got {distance:g} m")
@@ -182,7 +182,7 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
 
 
 def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
-    """Lift a depth image to world points (paper Eq. 2-4).
+    """Unproject a depth image to world points (paper Eq. 2-4).
 
     Args:
         depth: (H, W) float, finite, metres along the optical axis.
@@ -192,7 +192,7 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
         (H, W, 3) float64, world coordinates in metres.
 
     Raises:
-        ValueError: if the image's size is not the camera's.
+        ValueError: if the depth image and the camera differ in size.
     """
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")

@@ -1,4 +1,4 @@
-"""The gripper as seen from above: two finger squares whose value is the gripper's height (paper Figure 11)."""
+"""Top-down gripper image: two squares for the fingers, with the gripper's height as value (paper Figure 11)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lerobot_symview.geometry.workspace import Workspace
 
 @dataclass(frozen=True)
 class GripperShape:
-    """How a parallel gripper is drawn.
+    """Dimensions of a parallel gripper in the gripper image.
 
     Args:
         opening: distance between the fingers' inner faces at aperture 1, metres.
-        finger: side of the square that stands for a finger, metres.
+        finger: side of the square that represents a finger, metres.
     """
 
     opening: float = 0.08
@@ -28,19 +28,19 @@ class GripperShape:
 
 
 def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperShape | None = None) -> Any:
-    """Draw the gripper of each state into a top-down image.
+    """Draw the gripper of each state as a top-down image.
 
     Args:
         state: (..., 5) float numpy array or torch tensor: x, y (metres, relative to the workspace centre), z (metres),
             yaw (radians; at 0 the fingers open along x), aperture in [0, 1].
-        workspace: what the image covers.
-        pixels: side of the image.
+        workspace: the square on the table that the image covers.
+        pixels: rows and columns of the image.
         shape: the gripper's dimensions.
 
     Returns:
-        (..., pixels, pixels), same kind and dtype as `state`: z / workspace.height_limit inside a finger, 0 outside. A
-        finger's border pixels are covered in part, so the picture moves smoothly with the gripper; it turns and
-        mirrors exactly with the state, by any angle.
+        (..., pixels, pixels), same array type and dtype as `state`: z / workspace.height_limit inside a finger, 0
+        outside. A finger's border pixels are antialiased, so the image changes smoothly with the gripper's pose.
+        Rotating or reflecting the state, by any angle, is equivalent to drawing the rotated or reflected fingers.
     """
     shape = shape or GripperShape()
     xp = array_api_compat.array_namespace(state)
@@ -49,7 +49,7 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
     x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
     forward = centers[:, None] - x
     sideward = centers[None, :] - y
-    along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # a finger stands on either side: |.| draws both
+    along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # the fingers are symmetric: |.| draws both
     across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
     resolution = workspace.size / pixels
     finger_center = (aperture * shape.opening + shape.finger) / 2
@@ -60,9 +60,9 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
 def gripper_image_uint8(
     state: NDArray[np.floating], workspace: Workspace, pixels: int, shape: GripperShape | None = None
 ) -> NDArray[np.uint8]:
-    """Draw the gripper of one state (5,) as `gripper_image` does, in grey levels: (pixels, pixels) uint8, 255 = 1.
+    """Draw the gripper of one state (5,) as `gripper_image` does, as grey levels: (pixels, pixels) uint8, 255 = 1.
 
-    Only the square that the gripper can fill is computed.
+    Only pixels within the gripper's bounding square are computed.
     """
     shape = shape or GripperShape()
     x, y, z, yaw, aperture = np.asarray(state, dtype=np.float64).tolist()
@@ -72,19 +72,19 @@ def gripper_image_uint8(
     for center in (x, y):
         first, last = (center - reach) / resolution + pixels / 2, (center + reach) / resolution + pixels / 2
         spans.append((max(math.floor(first), 0), min(math.ceil(last), pixels)))
-    picture = np.zeros((pixels, pixels), dtype=np.uint8)
+    image = np.zeros((pixels, pixels), dtype=np.uint8)
     finger_center = (aperture * shape.opening + shape.finger) / 2
-    place = (x, y, math.cos(yaw), math.sin(yaw), finger_center, shape.finger / 2)
-    _paint(picture, spans[0], spans[1], workspace.size, place, z / workspace.height_limit)
-    return picture
+    pose = (x, y, math.cos(yaw), math.sin(yaw), finger_center, shape.finger / 2)
+    _paint(image, spans[0], spans[1], workspace.size, pose, z / workspace.height_limit)
+    return image
 
 
 @njit(cache=True, nogil=True)
-def _paint(picture, rows, columns, size, place, brightness):  # type: ignore[no-untyped-def]
-    """Draw as `gripper_image` does, pixel by pixel."""
-    pixels = picture.shape[0]
+def _paint(image, rows, columns, size, pose, brightness):  # type: ignore[no-untyped-def]
+    """Compute `gripper_image` pixel by pixel within the given rows and columns."""
+    pixels = image.shape[0]
     resolution = size / pixels
-    x, y, cos, sin, finger_center, half = place
+    x, y, cos, sin, finger_center, half = pose
     for i in range(rows[0], rows[1]):
         forward = ((i + 0.5) / pixels - 0.5) * size - x
         for j in range(columns[0], columns[1]):
@@ -93,7 +93,7 @@ def _paint(picture, rows, columns, size, place, brightness):  # type: ignore[no-
             across = abs(sideward * cos - forward * sin)
             inside = min(max((half - abs(along - finger_center)) / resolution + 0.5, 0.0), 1.0)
             beside = min(max((half - across) / resolution + 0.5, 0.0), 1.0)
-            picture[i, j] = np.rint(255 * min(max(inside * beside * brightness, 0.0), 1.0))
+            image[i, j] = np.rint(255 * min(max(inside * beside * brightness, 0.0), 1.0))
 
 
 def _ramp(xp: Any, distance: Any, shape: GripperShape, resolution: float) -> Any:

@@ -1,4 +1,4 @@
-"""RGB perspective: a plane parallel to the table warped into an image from above (paper section 4.2)."""
+"""Homography of a plane parallel to the table, and its warp to a top-down image (paper section 4.2)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
 
-FARTHEST = 30_000.0  # pixels
+FARTHEST = 30_000.0  # pixels; within int16
 
 
 class WarpMap(NamedTuple):
-    """What `cv2.remap` reads: see `warp_map`."""
+    """Maps for `cv2.remap`, in its fixed-point format: see `warp_map`."""
 
     whole: NDArray[np.int16]
     fraction: NDArray[np.uint16]
@@ -27,7 +27,7 @@ def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_
     """Return the homography (3, 3) from top-down pixels (column, row, 1) to camera pixels (u, v, 1), up to scale.
 
     The plane lies `plane_height` metres above the table. y = K(Rx + t) restricted to that plane is itself a
-    homography, so nothing is solved for: the four workspace corners go to the four image corners by construction.
+    homography, so no linear system is solved: the workspace corners map to the image corners by construction.
 
     Raises:
         CalibrationError: if a corner of the plane lies behind the camera, or the camera lies in the plane.
@@ -51,43 +51,43 @@ def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_
 
 @lru_cache(maxsize=64)
 def warp_map(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> WarpMap:
-    """Return where in the camera's image each pixel of the top-down image lies, for `warp_plane`.
+    """Return the camera pixel of each pixel of the top-down image, for `warp_plane`.
 
-    It is kept for cameras and planes seen before, since finding it takes longer than using it.
+    Maps of recent cameras and planes are cached, since computing one takes longer than applying it.
 
     Returns:
-        (pixels, pixels, 2) int16, whole camera pixels (u, v), and (pixels, pixels) uint16, the fractions in steps of
-        1/32 pixel: OpenCV's fixed-point form.
+        (pixels, pixels, 2) int16, integer part of the camera pixels (u, v), and (pixels, pixels) uint16, their
+        fractional parts in steps of 1/32 pixel: OpenCV's fixed-point format.
 
     Raises:
-        CalibrationError: as `image_from_topdown`.
+        CalibrationError: for the same reasons as `image_from_topdown`.
     """
     homography = image_from_topdown(camera, workspace, pixels, plane_height)
     columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
     u, v, w = homography @ np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
-    # Beyond the image lies black, however far; int16 holds no more.
+    # Pixels outside the image are black at any distance; clip to the range of int16.
     image_xy = np.clip(np.stack([u, v], axis=-1) / w[:, None], -FARTHEST, FARTHEST).astype(np.float32)
     whole, fraction = cv2.convertMaps(image_xy.reshape(pixels, pixels, 2), None, cv2.CV_16SC2)
     return WarpMap(whole, fraction)
 
 
 def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: WarpMap) -> NDArray[np.uint8]:
-    """Warp a plane to lie flat (paper section 4.2).
+    """Warp a camera image to the top-down image of a plane (paper section 4.2).
 
     Args:
         rgb: (H, W, 3) uint8.
-        image_from_topdown: what `warp_map` returned for its camera.
+        image_from_topdown: the maps from `warp_map` for the image's camera.
 
     Returns:
-        (pixels, pixels, 3) uint8, bilinear, black where the plane lies outside the image.
+        (pixels, pixels, 3) uint8, bilinearly interpolated, black where the plane lies outside the image.
     """
     return np.asarray(cv2.remap(rgb, *image_from_topdown, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def camera_direction(camera: Camera, workspace: Workspace) -> Array:
-    """Return the horizontal unit vector (2,) from the workspace centre to the camera; zero straight above it.
+    """Return the horizontal unit vector (2,) from the workspace centre to the camera; zero if the camera is above it.
 
-    It transforms as irrep(1, 1) and tells an equivariant network from where it is looking (paper section 4.2).
+    The vector transforms as irrep(1, 1) and gives an equivariant network the viewing direction (paper section 4.2).
     """
     offset = camera.position[:2] - np.asarray(workspace.center)
     length = np.linalg.norm(offset)

@@ -1,4 +1,4 @@
-"""What to show where no point fell (paper A.5)."""
+"""Infill of empty cells in reprojected images (paper A.5)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 LOCAL_WINDOW = 5  # pixels, side of the neighbourhood that `local` infill averages
-NOWHERE = 1 << 15  # rows away: farther than any image is large
-NEAR = 2  # columns
+NOWHERE = 1 << 15  # rows; larger than any image
+NEAR = 2  # columns that the vectorised search covers
 
 
 def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
@@ -19,8 +19,8 @@ def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
         known: (H, W) bool.
 
     Returns:
-        (H, W) int32, row-major index of the nearest known pixel, which for a known one is itself. Of equally near ones
-        the one in the leftmost column, and in that the uppermost. -1 everywhere if none is known.
+        (H, W) int32, row-major index of the nearest known pixel; a known pixel's own index. Ties go to the leftmost
+        column, then to the uppermost row. -1 everywhere if no pixel is known.
     """
     row_of, nearest = np.empty(known.shape, dtype=np.int32), np.empty(known.shape, dtype=np.int32)
     if known.size:
@@ -29,10 +29,10 @@ def nearest_known(known: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 
 def fill_local(image: NDArray, known: NDArray[np.bool_]) -> NDArray:
-    """Give every pixel of `image` (H, W) or (H, W, C) that is not `known` (H, W) the mean of the known ones nearby.
+    """Fill every unknown pixel of `image` (H, W) or (H, W, C) with the mean of the `known` (H, W) pixels around it.
 
-    Nearby is a window of 5 x 5 pixels; a pixel without a known one in it keeps its value (paper A.5). The dtype is
-    kept, means of integers are rounded.
+    The window is 5 x 5 pixels; a pixel without known pixels in its window keeps its value (paper A.5). The dtype is
+    kept; means of integers are rounded.
     """
     weight = _window_sum(known.astype(np.float32))
     reachable = ~known & (weight > 0.5)
@@ -51,9 +51,9 @@ def _window_sum(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @njit(cache=True, nogil=True)
 def _find_nearest(known, row_of, nearest):  # type: ignore[no-untyped-def]
-    """Find, per column, the nearest known row of every pixel; then search each row sideways while it can get nearer.
+    """Find the nearest known row of every pixel per column; then search each row sideways while that can be nearer.
 
-    Loops over a whole row are written so that they become vector instructions: 32-bit, and without branches.
+    Loops over a whole row use 32-bit integers and no branches, so that the compiler vectorises them.
     """
     rows, columns = known.shape
     for c in range(columns):
@@ -69,7 +69,7 @@ def _find_nearest(known, row_of, nearest):  # type: ignore[no-untyped-def]
     if row_of[0].max() < 0:
         nearest[:] = -1
         return
-    # Squared distances in rows, between borders that are too far to be chosen, so that no step need be tested.
+    # Squared row distances, padded with values too large to be chosen, so that no step needs a bounds test.
     border = columns + NEAR
     far = np.full(columns + 2 * border, NOWHERE**2, dtype=np.int32)
     middle = far[border : border + columns]
@@ -80,13 +80,13 @@ def _find_nearest(known, row_of, nearest):  # type: ignore[no-untyped-def]
             distance = np.int32(row_of_column[c] - r)
             distance = np.int32(distance * distance)
             middle[c], best[c], chosen[c] = distance, distance, 0
-        for step in range(1, NEAR + 1):  # nearly all pixels have a known one so near
+        for step in range(1, NEAR + 1):  # nearly all pixels have a known pixel this near
             lefts, rights = far[border - step : border - step + columns], far[border + step : border + step + columns]
             to_left, to_right, sideways = np.int32(-step), np.int32(step), np.int32(step * step)
             for c in range(columns):
                 left, right = np.int32(lefts[c] + sideways), np.int32(rights[c] + sideways)
                 nearer, offset = best[c], chosen[c]
-                offset = to_left if left <= nearer else offset  # of equals the leftmost
+                offset = to_left if left <= nearer else offset  # ties go to the leftmost
                 nearer = left if left <= nearer else nearer
                 chosen[c] = to_right if right < nearer else offset
                 best[c] = right if right < nearer else nearer
@@ -100,7 +100,7 @@ def _find_nearest(known, row_of, nearest):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _search(far, center, columns, best, offset):  # type: ignore[no-untyped-def]
-    """Go on sideways from where the steps that all pixels take have ended."""
+    """Continue the sideways search of one pixel beyond `NEAR` columns."""
     step = NEAR + 1
     while step * step <= best and step < columns:
         left, right = far[center - step] + step * step, far[center + step] + step * step

@@ -1,4 +1,4 @@
-"""Where a camera stands: named by angles around the workspace or by matrices, turned into a calibrated camera."""
+"""Camera placement, by angles around the workspace or by matrices, and the calibrated camera that results."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from lerobot_symview.geometry.camera import Array, Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace, check_visible
 
-TOP_DISTANCE = 8.0  # metres: from so far above, perspective shifts a 5 cm block's top by less than a millimetre
+TOP_DISTANCE = 8.0  # metres: at this distance perspective shifts the top of a 5 cm block by less than a millimetre
 TRIES = 100
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class CameraSpread:
-    """How far a camera's pose may be, at most, from the stated one; drawn anew and uniformly for every episode."""
+    """Largest deviation of a camera's pose from its nominal pose; sampled uniformly for every episode."""
 
     elevation_deg: float = 0.0
-    """Degrees, within 1 to 90 degrees above the table."""
+    """Degrees; the sampled elevation stays within 1 to 90 degrees above the table."""
     azimuth_deg: float = 0.0
-    """Degrees; 180 draws from everywhere around the table."""
+    """Degrees; 180 samples all directions around the table."""
     distance: float = 0.0
     """Metres."""
     target: float = 0.0
-    """Metres, along each axis of the point looked at."""
+    """Metres, along each axis of the look-at point."""
 
     def __post_init__(self) -> None:
         if min(astuple(self)) < 0:
@@ -34,10 +34,10 @@ class CameraSpread:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole camera over the workspace, and the flaws of its depth sensor."""
+    """A pinhole camera over the workspace, and the noise of its depth sensor."""
 
     name: str = "side"
-    """Prefix of its keys, such as `side`."""
+    """Name of the camera in feature keys, such as `side`."""
     height: int = 152
     """Rows, pixels."""
     width: int = 152
@@ -45,26 +45,26 @@ class CameraSpec:
     fov_deg: float = 48.0
     """Vertical field of view, degrees."""
     elevation_deg: float = 45.0
-    """Degrees above the table."""
+    """Elevation above the table, degrees."""
     azimuth_deg: float = 0.0
-    """Degrees about the vertical; 0 faces the robot."""
+    """Azimuth about the vertical, degrees; 0 faces the robot."""
     distance: float = 0.81
-    """Metres from the point looked at."""
+    """Distance from the look-at point, metres."""
     target: Vector = (0.0, 0.0, 0.0)
-    """Point looked at, metres from the centre of the workspace on the table."""
+    """Look-at point, metres, relative to the centre of the workspace on the table."""
     spread: CameraSpread = field(default_factory=CameraSpread)
-    """How far the pose may differ from episode to episode."""
+    """Largest random deviation of the pose in each episode."""
     intrinsics: tuple[float, ...] | None = None
-    """K in pixels, 9 numbers row by row, in place of fov_deg."""
+    """K in pixels, 9 numbers, row-major; replaces fov_deg."""
     world_from_cam: tuple[float, ...] | None = None
-    """Pose in metres, 16 numbers row by row, OpenCV axes, in place of the angles, distance and target."""
+    """Pose, 16 numbers, row-major, metres, OpenCV axes; replaces the angles, distance and target."""
     sees_robot: bool = True
-    """Whether the arm is drawn; False gives an oracle."""
+    """Whether the arm is rendered; False gives an oracle camera."""
     depth_noise: float = 0.0
-    """Standard deviation of depth at 1 m, metres; grows with the square of the depth as a stereo camera's does."""
+    """Standard deviation of depth at 1 m, metres; grows with the square of the depth, as for a stereo camera."""
     depth_dropout: float = 0.0
-    """Share of the pixels without depth. Beside a jump of depth, which one of a stereo camera's eyes does not see past,
-    it is ten times as large."""
+    """Fraction of pixels without depth. It is ten times as large beside depth discontinuities, where one of a stereo
+    camera's two sensors is occluded."""
 
     def __post_init__(self) -> None:
         problems = []
@@ -89,7 +89,7 @@ class CameraSpec:
 
     @property
     def varies(self) -> bool:
-        """Whether every episode sees from another place."""
+        """Whether the pose is sampled for every episode."""
         return max(astuple(self.spread)) > 0
 
     def place(
@@ -98,28 +98,28 @@ class CameraSpec:
         """Return the calibrated camera over `workspace`.
 
         Args:
-            workspace: what it has to see.
-            rng: draws a pose within the spread; without it, or without a spread, the pose is the stated one.
-            minimum_visible: share of the working volume that has to be in the image.
+            workspace: the working volume that must be in the image.
+            rng: samples a pose within the spread; without it, or without a spread, the nominal pose is used.
+            minimum_visible: fraction of the working volume that must be in the image.
 
         Raises:
-            CalibrationError: if it sees less than `minimum_visible` (none of 100 drawn poses sees as much), or the
-                matrices are not a camera's.
+            CalibrationError: if less than `minimum_visible` of the working volume is in the image, for each of 100
+                sampled poses, or if the matrices are invalid.
         """
         camera = self._camera(workspace, rng)
         for _ in range(TRIES if rng is not None and self.varies else 0):
             if workspace.visible_fraction(camera) >= minimum_visible:
                 break
             camera = self._camera(workspace, rng)
-        remedy = "raise its distance or fov_deg, turn it towards the workspace, or lower its spread"
+        remedy = "raise its distance or fov_deg, point it at the workspace, or lower its spread"
         check_visible(self.name, camera, workspace, remedy, minimum_visible)
         return camera
 
     def _camera(self, workspace: Workspace, rng: np.random.Generator | None) -> Camera:
-        spec = self if rng is None or not self.varies else self._drawn(rng)
+        spec = self if rng is None or not self.varies else self._sampled(rng)
         return Camera(spec._intrinsics(), spec._pose(workspace), self.height, self.width)
 
-    def _drawn(self, rng: np.random.Generator) -> CameraSpec:
+    def _sampled(self, rng: np.random.Generator) -> CameraSpec:
         spread = self.spread
         lowest = max(self.elevation_deg - spread.elevation_deg, min(1.0, self.elevation_deg))
         return replace(
@@ -143,6 +143,6 @@ class CameraSpec:
 
 
 def top_camera(size: int, workspace: Workspace) -> CameraSpec:
-    """Oracle of `size` x `size` pixels: from straight above, framing the table's square exactly, arm not drawn."""
+    """Return the top-down oracle camera: `size` x `size` pixels that show exactly the workspace, without the arm."""
     fov_deg = 2 * np.rad2deg(np.arctan(workspace.size / 2 / TOP_DISTANCE))
     return CameraSpec("top", size, size, fov_deg=fov_deg, elevation_deg=90.0, distance=TOP_DISTANCE, sees_robot=False)

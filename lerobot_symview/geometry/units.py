@@ -1,4 +1,4 @@
-"""Units of depth and height images. Behind a dataset's reader or a policy's first processor step all are metres."""
+"""Units of depth and height images. Dataset readers and the policies' first processor step convert all to metres."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 Unit = Literal["m", "mm"]
 UNIT_NAMES: dict[Unit, str] = {"m": "metres", "mm": "millimetres"}
 MILLIMETRES_PER_METRE = 1000.0
-METRES_AT_MOST = 10.0  # nothing on a table is farther or higher, and nothing is seen from as many millimetres
+METRES_AT_MOST = 10.0  # table scenes have no larger value in metres, and cameras measure no depth below 10 mm
 
 
 def in_metres(depth: NDArray, unit: Unit | None = None) -> NDArray[np.floating]:
@@ -19,10 +19,10 @@ def in_metres(depth: NDArray, unit: Unit | None = None) -> NDArray[np.floating]:
 
     Args:
         depth: any shape, float or integer.
-        unit: of `depth`; None is LeRobot's convention, float metres and integer millimetres (as a RealSense delivers).
+        unit: unit of `depth`; None is LeRobot's convention, float metres and integer millimetres (as from a RealSense).
 
     Returns:
-        The same shape; float32 from integers, else the dtype of `depth`.
+        The same shape; float32 for integer input, else the dtype of `depth`.
     """
     is_float = np.issubdtype(depth.dtype, np.floating)
     if unit == "m" or (unit is None and is_float):
@@ -31,10 +31,10 @@ def in_metres(depth: NDArray, unit: Unit | None = None) -> NDArray[np.floating]:
 
 
 def infer_depth_unit(depth: Any) -> Unit:
-    """Return the unit that depth images, of a kind that declares none, are most likely in.
+    """Return the most likely unit of depth images whose feature declares none.
 
-    Integers are millimetres. Floats are millimetres if most valid pixels exceed 10: a camera over a table sees nothing
-    at 10 mm and little at 10 m, and a few wrong pixels change nothing.
+    Integers are millimetres. Floats are millimetres if most valid pixels exceed 10: a camera over a table measures no
+    depth below 10 mm and few beyond 10 m. The majority decides, so that outliers do not matter.
 
     Args:
         depth: any shape, NumPy array or torch tensor; 0, negative or non-finite = invalid.
@@ -48,13 +48,13 @@ def infer_depth_unit(depth: Any) -> Unit:
 
 
 def infer_height_unit(heights: Any) -> Unit:
-    """Return the unit that height maps, of a kind that declares none, are most likely in.
+    """Return the most likely unit of height maps whose feature declares none.
 
-    Most of a table is bare, so one height above 10 decides, not the majority. Millimetres without any show nothing
-    higher than 1 cm.
+    Floats are millimetres if any height exceeds 10: most of a table is empty, so the majority cannot decide. A map in
+    millimetres without such a height shows no object higher than 1 cm.
 
     Args:
-        heights: any shape, NumPy array or torch tensor, above the table.
+        heights: any shape, NumPy array or torch tensor; height above the table.
     """
     xp = array_api_compat.array_namespace(heights)
     if not xp.isdtype(heights.dtype, "real floating"):

@@ -1,4 +1,4 @@
-"""Depth images of more pixels than were measured, so that neighbouring points leave no gaps when seen from above."""
+"""Upsampling of depth images, so that neighbouring points leave no gaps in the top-down image."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import Array
 
-# Between neighbouring pixels whose depths differ by more, a surface ends: a plane seen at 15 degrees stays below it.
+# Larger relative depth steps between neighbouring pixels are edges; a plane at 15 degrees to the view stays below.
 MAX_STEP = 0.04
 
 
 def enlarge_depth(depth: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
-    """Interpolate a depth image between its pixels where they show one surface.
+    """Upsample a depth image; interpolate within surfaces, not across depth edges.
 
     The inverse of depth is affine over a plane's image, so its bilinear interpolation is exact for planes. Across an
-    edge, where neighbours differ by more than 4 %, and beside invalid pixels the nearest pixel's depth is repeated.
+    edge, where neighbours differ by more than 4 %, and beside invalid pixels, the nearest pixel's depth is repeated.
 
     Args:
         depth: (H, W) float, metres along the optical axis; 0, negative, infinite and NaN are invalid.
-        factor: how many rows and columns replace one, at least 1.
+        factor: upsampling factor of rows and columns, at least 1.
 
     Returns:
         (factor * H, factor * W) float32, metres, 0 where invalid; for the camera `Camera.enlarged(factor)`.
@@ -37,7 +37,7 @@ def enlarge_depth(depth: NDArray[np.floating], factor: int) -> NDArray[np.float3
 
 @lru_cache(maxsize=64)
 def _neighbours(count: int, factor: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Index of the pixels before and after each new one along an axis, and how far (0 to 1) it lies between them."""
+    """Indices of the pixels before and after each new pixel along an axis, and its interpolation weight (0 to 1)."""
     position = np.clip((np.arange(factor * count) + 0.5) / factor - 0.5, 0, count - 1)
     before = np.floor(position).astype(np.int64)
     return before, np.minimum(before + 1, count - 1), position - before

@@ -1,4 +1,4 @@
-"""The square on the table that a top-down image shows, and the pixel grid laid over it."""
+"""The square on the table that a top-down image shows, and its pixel grid."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera, project
 
-MINIMUM_VISIBLE = 0.6  # share of the working volume
+MINIMUM_VISIBLE = 0.6  # fraction of the working volume
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,11 @@ class Workspace:
     """A square, axis-aligned working area on the table z = 0.
 
     Raises:
-        ValueError: if a number is not finite, or a length not positive.
+        ValueError: if a value is not finite, or a length is not positive.
     """
 
     center: tuple[float, float] = (0.45, 0.0)
-    """x and y of its centre in the world, metres."""
+    """x and y of the square's centre in the world frame, metres."""
     size: float = 0.4
     """Side T of the square, metres."""
     height_limit: float = 0.25
@@ -29,7 +29,7 @@ class Workspace:
 
     def __post_init__(self) -> None:
         if not np.isfinite([*self.center, self.size, self.height_limit]).all():
-            raise ValueError(f"a workspace must be finite, got {self}")
+            raise ValueError(f"workspace values must be finite, got {self}")
         if self.size <= 0 or self.height_limit <= 0:
             raise ValueError(
                 f"workspace size and height_limit must be positive metres, got {self.size:g} and {self.height_limit:g}"
@@ -53,7 +53,7 @@ class Workspace:
         return np.column_stack([offsets + self.center, np.full(4, float(height))])
 
     def visible_fraction(self, camera: Camera, samples: int = 9) -> float:
-        """Fraction of the working volume (a samples^3 lattice, borders included) that lies in the camera's image."""
+        """Fraction of the working volume (a samples^3 grid, borders included) that projects into the image."""
         half = self.size / 2
         axes = (
             np.linspace(self.center[0] - half, self.center[0] + half, samples),
@@ -68,10 +68,10 @@ class Workspace:
 def check_visible(
     name: str, camera: Camera, workspace: Workspace, remedy: str, minimum: float = MINIMUM_VISIBLE
 ) -> None:
-    """Refuse a camera that sees too little.
+    """Raise an error if too little of the working volume is in the camera's image.
 
     Raises:
-        CalibrationError: if less than `minimum` of the working volume is in its image; says how much, and the `remedy`.
+        CalibrationError: if less than `minimum` of the working volume is visible; the message ends with `remedy`.
     """
     visible = workspace.visible_fraction(camera)
     if visible < minimum:

@@ -1,6 +1,6 @@
-"""Orthographic z-buffer: points, or the pixels of depth images, drawn from above, the highest in front.
+"""Orthographic top-down z-buffer of points or depth images: each cell keeps its highest point.
 
-Compiled with numba. A cell's point is the one of greatest height, in float32; of equals, the first.
+Compiled with numba. Heights are compared in float32; ties go to the first point.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
 
-EMPTY = -1  # source of a cell that no point fell into
+EMPTY = -1  # source of a cell without points
 
 
 class ZBuffer(NamedTuple):
-    """What is highest in each cell of a top-down grid of P x P cells.
+    """The highest point of each cell in a top-down grid of P x P cells.
 
     Attributes:
-        height: (P, P) float32, metres above the table; 0 where nothing is.
-        source: (P, P) int32, index of the point; `EMPTY` where nothing is.
+        height: (P, P) float32, metres above the table; 0 in empty cells.
+        source: (P, P) int32, index of the point; `EMPTY` in empty cells.
     """
 
     height: NDArray[np.float32]
@@ -32,18 +32,18 @@ class ZBuffer(NamedTuple):
 
 
 def zbuffer_from_points(points: Array, workspace: Workspace, pixels: int, ceiling: float = np.inf) -> ZBuffer:
-    """Draw points from above (paper Eq. 5-6).
+    """Render points into a top-down z-buffer (paper Eq. 5-6).
 
     Args:
-        points: (N, 3) float64 world coordinates, metres; a point that is not finite is left out.
-        workspace: what the grid covers.
-        pixels: side of the grid.
-        ceiling: metres above the table; what is higher is left out.
+        points: (N, 3) float64 world coordinates, metres; non-finite points are ignored.
+        workspace: the square on the table that the grid covers.
+        pixels: rows and columns of the grid.
+        ceiling: metres above the table; higher points are ignored.
 
     Returns:
-        A buffer whose source is the index of the point. Points outside the workspace's square are nowhere.
+        A buffer whose source is the point's index. Points outside the workspace's square are ignored.
     """
-    buffer = _cleared(pixels)
+    buffer = _empty_buffer(pixels)
     rows_columns = workspace.pixel_from_xy(points[:, :2], pixels) + 0.5
     _draw_points(rows_columns, points[:, 2], ceiling, *buffer)
     return buffer
@@ -56,24 +56,24 @@ def zbuffer_from_depth(
     pixels: int,
     ceiling: float = np.inf,
 ) -> ZBuffer:
-    """Draw the pixels of depth images, from one camera or several, from above (paper Eq. 2-6).
+    """Render depth images of one or more cameras into one top-down z-buffer (paper Eq. 2-6).
 
-    The same as `unproject` and `zbuffer_from_points`, in one pass and without the points.
+    Equivalent to `unproject` and `zbuffer_from_points`, in one pass and without an array of points.
 
     Args:
-        depths: (H, W) float each, metres along the optical axis; 0, negative, infinite and NaN are left out.
-        cameras: their calibrations.
-        workspace: what the grid covers.
-        pixels: side of the grid.
-        ceiling: metres above the table; what is higher is left out.
+        depths: (H, W) float each, metres along the optical axis; 0, negative, infinite and NaN are ignored.
+        cameras: calibrated camera of each depth image.
+        workspace: the square on the table that the grid covers.
+        pixels: rows and columns of the grid.
+        ceiling: metres above the table; higher points are ignored.
 
     Returns:
-        A buffer whose source is the index of the pixel, row by row, one image after the other.
+        A buffer whose source is the row-major index of the pixel, counted over all images in order.
 
     Raises:
-        ValueError: if an image's size is not its camera's.
+        ValueError: if a depth image and its camera differ in size.
     """
-    buffer = _cleared(pixels)
+    buffer = _empty_buffer(pixels)
     first = 0
     for depth, camera in zip(depths, cameras, strict=True):
         if depth.shape != (camera.height, camera.width):
@@ -86,15 +86,15 @@ def zbuffer_from_depth(
 def gather(
     shown: NDArray[np.int32], buffer: ZBuffer, colors: NDArray[np.uint8]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Look up what is drawn.
+    """Look up the colour and height that each pixel shows.
 
     Args:
-        shown: (P, P) int32, which cell of the buffer each pixel shows, row-major; -1 shows nothing.
-        buffer: what is highest in each cell.
-        colors: (N, 3) uint8, the colour of every source.
+        shown: (P, P) int32, row-major index of the cell that each pixel shows; -1 for none.
+        buffer: the z-buffer.
+        colors: (N, 3) uint8, colour of every source.
 
     Returns:
-        (P, P, 3) uint8 colours and (P, P) float32 heights; black and 0 where nothing is shown.
+        (P, P, 3) uint8 colours and (P, P) float32 heights; black and 0 where no point is shown.
     """
     rgb = np.zeros((*shown.shape, 3), dtype=np.uint8)
     height = np.zeros(shown.shape, dtype=np.float32)
@@ -102,16 +102,16 @@ def gather(
     return rgb, height
 
 
-def _cleared(pixels: int) -> ZBuffer:
+def _empty_buffer(pixels: int) -> ZBuffer:
     return ZBuffer(np.zeros((pixels, pixels), np.float32), np.full((pixels, pixels), EMPTY, np.int32))
 
 
 @lru_cache(maxsize=256)
 def grid_from_pixel(camera: Camera, workspace: Workspace, pixels: int) -> tuple[Array, Array]:
-    """Return A (3, 3) and b (3,): pixel (u, v) at depth d lies at d A (u, v, 1) + b in (row, column, height).
+    """Return A (3, 3) and b (3,): pixel (u, v) at depth d maps to (row, column, height) = d A (u, v, 1) + b.
 
-    This is paper Eq. 2-6 in one, as float64. Pixels are integers at their centres, depth is in metres along the optical
-    axis; rows and columns count from the grid's edge, in cells; heights are metres above the table.
+    A and b are float64 and combine paper Eq. 2-6. Integer (u, v) are pixel centres; depth is in metres along the
+    optical axis; rows and columns are in cells, measured from the grid's edge; height is in metres above the table.
     """
     scale = np.array([pixels / workspace.size, pixels / workspace.size, 1.0])
     rays = camera.world_from_cam[:3, :3] @ np.linalg.inv(camera.intrinsics)

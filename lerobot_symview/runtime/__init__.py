@@ -1,1 +1,1 @@
-"""Command lines, worker processes and partial results: what every console command shares."""
+"""Infrastructure of the console commands: command lines, worker processes and atomic results."""

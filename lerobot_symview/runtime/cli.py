@@ -1,4 +1,4 @@
-"""What every console command shares: flags from a dataclass, one-line errors, exit codes."""
+"""Command lines of all console commands: flags from a dataclass, one-line errors, exit codes."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview
 
 
 class CommandError(SymviewError):
-    """A command cannot do what its flags ask for; the message names the flag to change. Exit code 1, no traceback."""
+    """A command failed; the message names the remedy. The command exits with code 1 and prints no traceback."""
 
 
 @contextmanager
 def flagged(flag: str) -> Iterator[None]:
-    """Add the command-line flag to the message of a library's error.
+    """Prefix the messages of library errors with a command-line flag.
 
     Args:
-        flag: what to change, such as `--calibration=cameras.yaml`.
+        flag: the flag to change, such as `--calibration=cameras.yaml`.
     """
     try:
         yield
@@ -39,18 +39,18 @@ def flagged(flag: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class DatasetLocation:
-    """Where a dataset is."""
+    """Name and folder of a dataset."""
 
     repo_id: str
-    """`user/name`, its name on the Hub."""
+    """`user/name` of the dataset on the Hub."""
     root: Path | None = None
-    """Folder; by default LeRobot's own cache folder for `repo_id`."""
+    """Folder; by default LeRobot's cache folder for `repo_id`."""
 
     def __post_init__(self) -> None:
         check_repo_id(self.repo_id, "--dataset.repo_id")
 
     def folder(self) -> Path:
-        """Return the folder, resolved."""
+        """Return the absolute folder."""
         if self.root is not None:
             return Path(self.root).expanduser().resolve()
         from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -59,7 +59,7 @@ class DatasetLocation:
 
 
 def check_repo_id(repo_id: str, flag: str) -> None:
-    """Raise a ValueError that names `flag`, which states it, unless `repo_id` looks like a name on the Hub."""
+    """Raise a ValueError that names `flag` unless `repo_id` has the form user/name."""
     if repo_id.count("/") != 1 or not all(repo_id.split("/")):
         raise ValueError(f"{flag} must look like user/name, got {repo_id!r}")
 
@@ -70,10 +70,10 @@ def run_command[Config](
     examples: str,
     short: dict[str, str] | None = None,
 ) -> None:
-    """Parse the command line into `config_class`, run `main`, and end the process.
+    """Parse the command line into `config_class`, run `main`, and exit.
 
-    `short` maps abbreviated flags to the full ones.
-    Exit codes: 0 done, 2 a flag is wrong, 1 anything else; a user's mistake is one line on stderr.
+    `short` maps abbreviated flags to full flags. Exit codes: 0 success, 2 invalid flag, 1 other errors, 130
+    interrupted. Errors that a user can correct are printed as one line on stderr.
     """
     import draccus
 
@@ -89,16 +89,16 @@ def run_command[Config](
         sys.argv[index] = (short or {}).get(flag, flag) + equals + value
     if {"-h", "--help"} & set(sys.argv[1:]):
         sys.stdout.write(f"{config_class.__doc__ or ''}\n\nexamples:\n{examples}\n\n")
-    complaints = io.StringIO()
+    usage_errors = io.StringIO()
     try:
-        with redirect_stderr(complaints):
+        with redirect_stderr(usage_errors):
             config = draccus.parse(config_class)
-    except SystemExit as end:  # argparse: help was printed, or a flag is unknown and the usage precedes the reason
-        reason = complaints.getvalue().strip().rpartition("error: ")[2]
+    except SystemExit as end:  # argparse printed help, or usage and then the error of an unknown flag
+        reason = usage_errors.getvalue().strip().rpartition("error: ")[2]
         if end.code:
             _end(program, reason, USAGE)
         raise
-    except Exception as error:  # draccus raises what a field's type raises: each is a wrong flag
+    except Exception as error:  # draccus passes on any error of a field's type: each is an invalid flag
         _end(program, _reasons(error), USAGE)
     try:
         main(config)
@@ -112,9 +112,9 @@ def run_command[Config](
 
 
 def subcommand(kind: str, known: Mapping[str, object], default: str = "") -> str:
-    """Take the first argument, which names one of `known`, off the command line; a name that is not known ends it.
+    """Remove the subcommand, one of `known`, from the command line and return it; exit if it is unknown.
 
-    Without one it is `default`, which may be no name where only help or the version is asked for.
+    Without a subcommand return `default`. An empty name is accepted with --help and --version only.
     """
     name = sys.argv.pop(1) if len(sys.argv) > 1 and not sys.argv[1].startswith("-") else default
     try:
@@ -126,13 +126,13 @@ def subcommand(kind: str, known: Mapping[str, object], default: str = "") -> str
 
 
 def quiet() -> None:
-    """Show our messages and other libraries' errors: their warnings and inner progress bars say nothing to act upon."""
+    """Log this project's messages and only errors of other libraries; hide their warnings and progress bars."""
     warnings.simplefilter("ignore")
     os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("%(message)s"))
     for other in logging.root.handlers[:]:
-        if type(other) is logging.StreamHandler:  # of LeRobot's import, which logs
+        if type(other) is logging.StreamHandler:  # added by the import of LeRobot
             logging.root.removeHandler(other)
     logging.basicConfig(level=logging.ERROR, handlers=[handler])
     for package in PACKAGES:
@@ -140,7 +140,7 @@ def quiet() -> None:
 
 
 def _reasons(error: BaseException) -> str:
-    """Join an error's message with those of its causes: draccus names the field, its cause the value."""
+    """Join an error's message with those of its causes: draccus names the field, the cause names the value."""
     messages = [str(error)]
     while error.__cause__ is not None:
         error = error.__cause__

@@ -1,4 +1,4 @@
-"""Where work runs: in this process, in several, or on a Ray cluster."""
+"""Executors: run functions in this process, in worker processes, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from lerobot_symview.runtime.cli import CommandError, quiet
 
 
 class Executor(Protocol):
-    """Runs functions that can be pickled; a context manager."""
+    """Context manager that runs picklable functions."""
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
-        """Start `function(argument)` for every argument; return the results in the order in which they are done."""
+        """Start `function(argument)` for every argument; return the results in order of completion."""
         ...
 
     def __enter__(self) -> Self: ...
@@ -36,10 +36,10 @@ class Executor(Protocol):
 
 
 class SerialExecutor:
-    """Runs everything here, one after the other."""
+    """Executor that runs functions sequentially in this process."""
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
-        """Yield the results in order."""
+        """Yield the results in the order of the arguments."""
         yield from map(function, arguments)
 
     def __enter__(self) -> Self:
@@ -50,19 +50,19 @@ class SerialExecutor:
 
 
 class ProcessExecutor:
-    """Runs in processes of this machine.
+    """Executor with worker processes on this machine.
 
     Args:
-        num_workers: how many processes.
-        module: what they are going to run; imported at once and once for all, while the caller prepares their work,
-            unless this process has started others before.
+        num_workers: number of processes.
+        module: module that the workers use. The fork server imports it once for all workers while the caller prepares
+            their work, unless this process already has a running fork server.
     """
 
     def __init__(self, num_workers: int, module: str):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([module])
-        resource_tracker.ensure_running()  # else the server starts it, which unblocks signals
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # Ctrl-C is this process's to answer
+        resource_tracker.ensure_running()  # otherwise the fork server starts it, which unblocks signals
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # this process handles Ctrl-C
         try:
             forkserver.ensure_running()
         finally:
@@ -70,16 +70,16 @@ class ProcessExecutor:
         self._pool = ProcessPoolExecutor(num_workers, mp_context=context, initializer=_start_worker)
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
-        """Yield the results as they come.
+        """Yield the results in order of completion.
 
         Raises:
-            CommandError: if a process dies.
+            CommandError: if a worker process dies.
         """
-        with _worker_deaths():
+        with _worker_errors():
             return self._results([self._pool.submit(function, argument) for argument in arguments])
 
     def _results[R](self, futures: list[Future[R]]) -> Iterator[R]:
-        with _worker_deaths():
+        with _worker_errors():
             for future in as_completed(futures):
                 yield future.result()
 
@@ -87,20 +87,20 @@ class ProcessExecutor:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is KeyboardInterrupt:  # who wants to stop does not want to wait for what is under way
+        if kind is KeyboardInterrupt:  # do not wait for running work after an interrupt
             for process in multiprocessing.active_children():
                 process.terminate()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 class RayExecutor:
-    """Runs on the Ray cluster that `RAY_ADDRESS` names, or on a local one.
+    """Executor on the Ray cluster at `RAY_ADDRESS`, or on a local cluster.
 
-    The cluster's machines must see the same folders and have this package installed.
+    The cluster's machines must share the folders and have this package installed.
 
     Args:
-        num_workers: processes of a local cluster.
-        module: what they are going to run, imported when they do.
+        num_workers: number of processes of a local cluster.
+        module: module that the workers use; they import it on first use.
     """
 
     def __init__(self, num_workers: int, module: str):
@@ -115,7 +115,7 @@ class RayExecutor:
         ray.init(num_cpus=local, include_dashboard=False, log_to_driver=False, logging_level="error")
 
     def run[A, R](self, function: Callable[[A], R], arguments: Iterable[A]) -> Iterator[R]:
-        """Yield the results as they come; Ray repeats what a lost worker had begun."""
+        """Yield the results in order of completion; Ray restarts the tasks of lost workers."""
         task = self._ray.remote(lambda argument: function(argument))
         return self._results([task.remote(argument) for argument in arguments])
 
@@ -128,7 +128,7 @@ class RayExecutor:
             raise error.cause from None
         except self._ray.exceptions.RayError as error:
             raise CommandError(
-                f"the Ray cluster failed, repeat the command, with --resume=true if it has that flag: {error}"
+                f"the Ray cluster failed: repeat the command, with --resume=true if it has that flag: {error}"
             ) from None
 
     def __enter__(self) -> Self:
@@ -145,20 +145,20 @@ EXECUTORS: dict[str, Callable[[int, str], Executor]] = {
 
 
 @contextmanager
-def _worker_deaths() -> Iterator[None]:
+def _worker_errors() -> Iterator[None]:
     try:
         yield
     except BrokenProcessPool:
         raise CommandError(
-            "a worker process died, perhaps for lack of memory: repeat the command with a smaller --num_workers, "
+            "a worker process died, possibly out of memory: repeat the command with a smaller --num_workers, "
             "and with --resume=true if it has that flag"
         ) from None
 
 
 def _start_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when it does: a worker whose parent is killed would wait for ever."""
+    """Ignore Ctrl-C, and exit with the parent: the worker of a killed parent would wait forever."""
     quiet()
-    # Bars of several processes would overwrite each other.
+    # Progress bars of several processes would overwrite each other.
     tqdm.__init__ = partialmethod(tqdm.__init__, disable=True)  # type: ignore[method-assign, assignment]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

@@ -1,10 +1,10 @@
-"""Results appear whole or not at all: they are made in `<target>.partial` and moved to `<target>` in the end.
+"""Results are written atomically: to `<target>.partial`, which is renamed to `<target>` once it is complete.
 
-<target>.partial/request.json         what is made; a command that goes on with it must ask for the same
-<target>.partial/request.json.done    the same, once the result is in its place and the rest is being removed
-<target>.partial/...                  finished pieces, each complete or absent
+<target>.partial/request.json         settings of the result; a resumed run must have the same settings
+<target>.partial/request.json.done    the same file, renamed once the result is moved and the folder is being removed
+<target>.partial/...                  finished parts, each complete or absent
 
-A folder of that name with neither is somebody else's and stays as it is.
+A folder of that name without either file was not created by this module and is never modified.
 """
 
 from __future__ import annotations
@@ -25,20 +25,27 @@ DONE = f"{REQUEST}.done"
 
 
 def partial_folder(target: Path) -> Path:
-    """Return where `target` is made."""
+    """Return the folder in which `target` is written."""
     return target.with_name(target.name + ".partial")
 
 
 def plain(description: Any) -> dict[str, Any]:
-    """Return a description as JSON holds it, which is how two are compared."""
+    """Convert a description to JSON types, so that two descriptions can be compared."""
     return json.loads(json.dumps(description, default=str))
 
 
 def is_complete(target: Path, made_from: str, description: dict[str, Any], resume: bool, flag: str) -> bool:
-    """Whether an earlier run of the same command made `target`, whose `meta` folder keeps the description `made_from`.
+    """Whether `target` is the complete result of an earlier run with the same description.
+
+    Args:
+        target: folder of the result.
+        made_from: file in the `meta` folder of `target` that holds its description.
+        description: settings of this run.
+        resume: whether to accept an existing result.
+        flag: command-line flag that sets `target`.
 
     Raises:
-        CommandError: if `target` is something else, or `resume` was not asked for; it names `flag`, which chooses it.
+        CommandError: if `target` exists and has another description, or `resume` is False.
     """
     if not target.exists():
         return False
@@ -52,24 +59,25 @@ def is_complete(target: Path, made_from: str, description: dict[str, Any], resum
 
 
 def open_partial(folder: Path, description: dict[str, Any], resume: bool) -> None:
-    """Prepare the folder in which a result is made, or check that the one that is there makes the same result.
+    """Create the folder of a partial result, or check that the existing one has the same description.
 
     Raises:
-        CommandError: if there is one and `resume` was not asked for, or it was begun by another command or by none.
+        CommandError: if the folder exists and `resume` is False, it has another description, or it was not created by
+            this module.
     """
-    found = _request(folder)
-    if found is not None:
+    request = _request(folder)
+    if request is not None:
         if not resume:
-            raise CommandError(f"{folder} was begun and interrupted: add --resume=true to go on, or remove it")
-        different = [key for key in description if found.get(key) != description[key]]
+            raise CommandError(f"{folder} is from an interrupted run: add --resume=true to continue, or remove it")
+        different = [key for key in description if request.get(key) != description[key]]
         if different:
             raise CommandError(
-                f"{folder} was begun with another {', '.join(different)}: repeat the command that began it or remove it"
+                f"{folder} is from a run with different {', '.join(different)}: repeat that command or remove it"
             )
         return
     if (folder / DONE).exists():
         remove_partial(folder)
-    _check_nobody_elses(folder)
+    _check_no_foreign_files(folder)
     folder.mkdir(parents=True, exist_ok=True)
     part = part_of(folder / REQUEST)
     part.write_text(json.dumps(description))
@@ -77,7 +85,7 @@ def open_partial(folder: Path, description: dict[str, Any], resume: bool) -> Non
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove the folder in which a result was made. Interrupted, it is still known as ours, and not gone on with."""
+    """Remove a partial folder. After an interruption it is still recognised, and it is never resumed."""
     if (folder / REQUEST).exists():
         (folder / REQUEST).replace(folder / DONE)
     for path in folder.iterdir():
@@ -90,42 +98,42 @@ def remove_partial(folder: Path) -> None:
 
 
 def _request(folder: Path) -> dict[str, Any] | None:
-    """Return what the result in `folder` is to be, None if no command says so there."""
+    """Return the description of the partial result in `folder`; None if there is none."""
     try:
-        found = json.loads((folder / REQUEST).read_text())
+        request = json.loads((folder / REQUEST).read_text())
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-    return found if isinstance(found, dict) else None
+    return request if isinstance(request, dict) else None
 
 
-def _check_nobody_elses(folder: Path) -> None:
+def _check_no_foreign_files(folder: Path) -> None:
     if not folder.exists():
         return
-    # A command that was killed at its very beginning leaves an unfinished request.
-    strangers = ["it is a file"]
+    # A command that was killed at its start leaves a temporary request file.
+    foreign = ["it is a file"]
     if folder.is_dir():
-        strangers = sorted(path.name for path in folder.iterdir() if not path.match(f"{REQUEST}.*.part"))
-    if strangers:
+        foreign = sorted(path.name for path in folder.iterdir() if not path.match(f"{REQUEST}.*.part"))
+    if foreign:
         raise CommandError(
-            f"results are made in {folder}, which holds what no command of ours put there "
-            f"({', '.join(strangers[:3])}): move it elsewhere or choose another folder for the result"
+            f"{folder} is needed for partial results and was not created by an earlier run "
+            f"({', '.join(foreign[:3])}): move it elsewhere or choose another folder for the result"
         )
 
 
 def part_of(path: Path) -> Path:
-    """Return a name beside `path`, used by nobody else, for what is not complete yet."""
+    """Return a unique temporary path beside `path`, for an incomplete file."""
     return path.with_name(f"{path.name}.{uuid4().hex}.part")
 
 
 @contextmanager
 def disk_errors(folder: Path) -> Iterator[None]:
-    """Say what to do when nothing more can be written to `folder`."""
+    """Convert write errors in `folder` to a CommandError that names the remedy."""
     try:
         yield
     except OSError as error:
         free = shutil.disk_usage(folder).free / 2**20
         full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         raise CommandError(
-            f"cannot write to {folder} ({free:.0f} MiB free): {error}. {'Make room and repeat' if full else 'Repeat'} "
-            "the command with --resume=true: what is finished is kept"
+            f"cannot write to {folder} ({free:.0f} MiB free): {error}. {'Free space and repeat' if full else 'Repeat'} "
+            "the command with --resume=true: finished parts are kept"
         ) from None

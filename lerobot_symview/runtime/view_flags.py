@@ -1,6 +1,6 @@
-"""Views on a command line: `--views='[reproj, {name: persp, plane_height: 0.025}]'`, and dotted flags for our own two.
+"""View flags: `--views='[reproj, {name: persp, plane_height: 0.025}]'`, and dotted flags of the built-in views.
 
-Importing this module lets draccus, LeRobot's command-line parser, read and write `ViewSpec`.
+Importing this module registers `ViewSpec` with draccus, LeRobot's command-line parser.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ draccus.encode.register(ViewSpec, lambda spec, *_: spec.plain())
 
 
 def views_from_flags(specs: Iterable[ViewSpec], size: int | None, dotted: Mapping[str, View]) -> dict[str, View]:
-    """Return the views that a command's flags ask for, by name.
+    """Return the views given by a command's flags, by name.
 
     Args:
-        specs: the views, each with options of its own.
-        size: rows and columns of those that do not say theirs.
-        dotted: options by dotted flags, such as `--reproj.clip=none`, for the views that have them.
+        specs: entries of `--views`, with their own options.
+        size: rows and columns of the views whose entries give no size.
+        dotted: view name -> view with the options of dotted flags, such as `--reproj.clip=none`.
 
     Raises:
-        ValueError: if there is no view, an unknown one, or one with an unknown or invalid option.
+        ValueError: if there is no view, or a view or an option is unknown or invalid.
     """
     return make_views(_merged(spec, size, dotted.get(spec.name)) for spec in map(ViewSpec.parse, specs))
 
 
 def _merged(spec: ViewSpec, size: int | None, dotted: View | None) -> ViewSpec:
-    """Return the specification with every option said: the list entry's, else `size`, else the dotted flags'."""
+    """Merge options: those of the list entry override `size`, which overrides the dotted flags."""
     shared: dict[str, Any] = {} if size is None else {"size": size}
     return ViewSpec(spec.name, (asdict(dotted) if dotted is not None else {}) | shared | spec.options)

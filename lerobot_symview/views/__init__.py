@@ -1,4 +1,4 @@
-"""Top-down views of camera frames: what a view is, the registry, and the two views of the paper."""
+"""Top-down views of camera frames: the interface, the registry, and the two views of the paper."""
 
 from lerobot_symview.views.base import (
     VIEWS,

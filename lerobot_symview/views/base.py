@@ -1,7 +1,7 @@
-"""What a view is: a pure function from one camera frame to top-down images, with a frozen configuration.
+"""Interface and registry of views. A view maps one camera frame to top-down images; its options are frozen.
 
-`VIEWS` is the one registry that the dataset command, the processor step and the simulators read. A new view is a frozen
-dataclass derived from `View` and decorated with `@register_view(name)`.
+The dataset command, the processor step and the simulators share the registry `VIEWS`. A new view is a frozen dataclass
+derived from `View` and decorated with `@register_view(name)`.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Frame:
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) float, metres along the optical axis; 0, negative or non-finite = invalid; None without a sensor.
-        camera: calibration.
+        depth: (H, W) float, metres along the optical axis; 0, negative or non-finite = invalid; None for RGB cameras.
+        camera: calibrated camera.
         workspace: the square on the table that views show.
-        gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture; None
-            where it is unknown: then no point is clipped and no gripper image is drawn.
+        gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture in
+            [0, 1]; None if unknown: then no point is clipped and no gripper image is drawn.
 
     Raises:
         ValueError: if an image's shape or dtype is wrong, or the gripper's state is not finite.
@@ -61,18 +61,18 @@ class Frame:
 
     @property
     def gripper_height(self) -> float | None:
-        """The gripper's height above the table, metres; None where its state is unknown."""
+        """The gripper's height above the table, metres; None if its state is unknown."""
         return None if self.gripper is None else float(self.gripper[2])
 
 
 def check_gripper(state: list[float]) -> None:
-    """Raise a ValueError for a gripper state that is not finite: it would clip all points or none."""
+    """Raise a ValueError if a gripper state is not finite, since it would clip all points or none."""
     if not all(map(math.isfinite, state)):
         raise ValueError(f"the gripper's x, y, z, yaw and aperture must be finite, got {state}")
 
 
 class View(ABC):
-    """Top-down images of a frame. Derived classes are frozen dataclasses whose fields are the view's options."""
+    """Base class of views. Derived classes are frozen dataclasses; their fields are the view's options."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     size: int  # rows and columns of every output
@@ -80,40 +80,40 @@ class View(ABC):
     @property
     @abstractmethod
     def outputs(self) -> Mapping[str, Kind]:
-        """Suffix of the feature -> "rgb" (uint8, (size, size, 3)) or "height" (float32, (size, size), metres)."""
+        """Suffix of the feature key -> "rgb" ((size, size, 3) uint8) or "height" ((size, size) float32, metres)."""
 
     @property
     def needs_depth(self) -> bool:
-        """Whether a frame must have depth."""
+        """Whether the view requires depth."""
         return False
 
     @property
     def uses_gripper(self) -> bool:
-        """Whether the outputs depend on the gripper's state, where it is known."""
+        """Whether the outputs depend on the gripper's state if it is known."""
         return False
 
     @abstractmethod
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return the image of every output."""
+        """Return one image for each entry of `outputs`."""
 
     def without_gripper(self) -> Self:
-        """Return the view for frames whose gripper state is unknown."""
+        """Return the variant of the view for frames without the gripper's state."""
         return self
 
     def with_mask(self) -> Self:
-        """Return the view with a mask of measured pixels among its outputs, if it has one."""
+        """Return the variant of the view that also outputs a mask of measured pixels, if the view supports one."""
         return self
 
     def in_color(self) -> Self:
-        """Return the view without height maps, for policies that take images of three channels.
+        """Return the variant of the view without height maps, for policies that accept three-channel images only.
 
         Raises:
-            ValueError: if it has an output of one channel that cannot be left out.
+            ValueError: if a one-channel output cannot be disabled.
         """
         view = replace(self, height=False) if "height" in option_names(type(self)) else self
         single = [output for output, kind in view.outputs.items() if kind == "height"]
         if single:
-            raise ValueError(f"the view makes {', '.join(single)}, which has one channel")
+            raise ValueError(f"the view outputs {', '.join(single)}, which has one channel")
         return view
 
 
@@ -132,19 +132,19 @@ def make_view(name: str, **options: Any) -> View:
     """Return the view registered as `name`.
 
     Raises:
-        ValueError: if there is none, it has no such option, or an option's value is invalid.
+        ValueError: if the view or an option is unknown, or an option's value is invalid.
     """
     return ViewSpec(name, options).make()
 
 
 class ViewSpec:
-    """A view as data: its name and its options.
+    """Specification of a view: its name and its options.
 
-    On a command line and in files it is the name alone, `reproj`, or a mapping, `{name: persp, plane_height: 0.025}`.
+    Command lines and files spell it as a name, `reproj`, or as a mapping, `{name: persp, plane_height: 0.025}`.
 
     Args:
-        name: as in `VIEWS`.
-        options: keyword arguments of the view; the others have their defaults.
+        name: key of the view in `VIEWS`.
+        options: keyword arguments of the view; options not given keep their defaults.
     """
 
     def __init__(self, name: str, options: Mapping[str, Any] | None = None):
@@ -152,24 +152,24 @@ class ViewSpec:
 
     @classmethod
     def parse(cls, entry: str | Mapping[str, Any] | ViewSpec) -> ViewSpec:
-        """Return the specification that a name or a mapping states.
+        """Return the specification given by a name or a mapping.
 
         Raises:
-            ValueError: if it is neither.
+            ValueError: if `entry` is neither.
         """
         if isinstance(entry, ViewSpec):
             return entry
         if isinstance(entry, str):
             return cls(entry)
         if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
-            raise ValueError(f"a view is a name or a mapping with a name and options, got {entry!r}")
+            raise ValueError(f"a view must be a name or a mapping with a name and options, got {entry!r}")
         return cls(entry["name"], {key: value for key, value in entry.items() if key != "name"})
 
     def make(self) -> View:
         """Return the view.
 
         Raises:
-            ValueError: if there is none of that name, it has no such option, or an option's value is invalid.
+            ValueError: if the view or an option is unknown, or an option's value is invalid.
         """
         cls = VIEWS[self.name]
         known = option_names(cls)
@@ -193,7 +193,7 @@ class ViewSpec:
 
 
 def option_names(view: Any) -> list[str]:
-    """Return the names of a view class's options."""
+    """Return the option names of a view class."""
     return [option.name for option in fields(view)]
 
 
@@ -201,24 +201,24 @@ def make_views(specs: Iterable[ViewSpec]) -> dict[str, View]:
     """Return the views by name.
 
     Raises:
-        ValueError: if there is none, or a name comes twice.
+        ValueError: if `specs` is empty or contains a name twice.
     """
     views: dict[str, View] = {}
     for spec in specs:
         if spec.name in views:
-            raise ValueError(f"the view {spec.name!r} is named twice")
+            raise ValueError(f"the view {spec.name!r} is given twice")
         views[spec.name] = spec.make()
     if not views:
-        raise ValueError("name at least one view")
+        raise ValueError("expected at least one view, got none")
     return views
 
 
 def gray_to_rgb(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Repeat a grey image (H, W) uint8 in three channels: (H, W, 3)."""
+    """Convert a grey image (H, W) uint8 to three equal channels (H, W, 3)."""
     return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
 
 
 def check_size(size: int) -> None:
-    """Raise a ValueError unless `size` is a view's number of rows and columns."""
+    """Raise a ValueError unless `size` is a valid number of rows and columns of a view."""
     if not isinstance(size, Integral) or not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"a view's size must be a whole number of {SMALLEST} to {LARGEST} pixels, got {size}")
+        raise ValueError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")

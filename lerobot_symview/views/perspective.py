@@ -22,13 +22,13 @@ def warp_table(
 
     Args:
         rgb: (H, W, 3) uint8.
-        camera: its calibration.
-        workspace: the square on the table that is shown.
+        camera: calibrated camera of the image.
+        workspace: the square on the table that the view shows.
         size: rows and columns of the view.
-        plane_height: metres above the table of the plane that is mapped exactly.
+        plane_height: height above the table, metres, of the plane that is mapped without parallax.
 
     Returns:
-        (size, size, 3) uint8; rows grow with the world's x, columns with y; black where the camera sees no table.
+        (size, size, 3) uint8; rows grow with the world's x, columns with y; black outside the camera's image.
 
     Raises:
         ValueError: if the image's shape or dtype is wrong, or the plane lies partly behind the camera.
@@ -39,15 +39,15 @@ def warp_table(
 
 @dataclass(frozen=True)
 class PerspectiveView(View):
-    """RGB perspective: a plane parallel to the table warped to a top-down image, and the gripper drawn on it."""
+    """RGB perspective: the homography of a plane parallel to the table to a top-down image, and a gripper image."""
 
     size: int = 152
     """Rows and columns."""
     plane_height: Literal["gripper"] | float = 0.0
-    """Metres above the table of the plane that is mapped exactly; `gripper` moves it with the gripper."""
+    """Height of the plane that is mapped without parallax, metres above the table; `gripper` follows the gripper."""
     gripper: bool = True
-    """Add `persp_gripper`, the fingers drawn as squares, brighter the higher they are, where the gripper's state is
-    known."""
+    """Add `persp_gripper` if the gripper's state is known: the fingers as squares whose brightness is the gripper's
+    height."""
 
     @property
     def outputs(self) -> dict[str, Kind]:
@@ -59,7 +59,7 @@ class PerspectiveView(View):
 
     @property
     def uses_gripper(self) -> bool:
-        """To draw it and to move the plane with it."""
+        """True if the gripper image is on or the plane follows the gripper."""
         return self.gripper or self.plane_height == "gripper"
 
     def __post_init__(self) -> None:
@@ -70,16 +70,16 @@ class PerspectiveView(View):
             raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
     def without_gripper(self) -> PerspectiveView:
-        """Draw no gripper.
+        """Return the view without the gripper image.
 
         Raises:
-            ValueError: if the plane is to move with it.
+            ValueError: if the plane follows the gripper.
         """
         self.plane(None)
         return replace(self, gripper=False)
 
     def plane(self, gripper_height: float | None) -> float:
-        """Return the height of the plane that is mapped exactly, metres, for a gripper at `gripper_height`."""
+        """Return the height of the warped plane, metres, for a gripper at `gripper_height`."""
         if self.plane_height != "gripper":
             return float(self.plane_height)
         if gripper_height is None:
@@ -87,11 +87,11 @@ class PerspectiveView(View):
         return gripper_height
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return the warped image and, where the gripper's state is known, the gripper image."""
+        """Return the warped image and, if the gripper's state is known, the gripper image."""
         plane_height = self.plane(frame.gripper_height)
         images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, plane_height))}
         if self.gripper and frame.gripper is not None:
-            from lerobot_symview.geometry.gripper import gripper_image_uint8  # numba
+            from lerobot_symview.geometry.gripper import gripper_image_uint8  # slow import: numba
 
             images["persp_gripper"] = gray_to_rgb(gripper_image_uint8(frame.gripper, frame.workspace, self.size))
         return images

@@ -25,7 +25,7 @@ class Reprojection(NamedTuple):
     Attributes:
         rgb: (size, size, 3) uint8; rows grow with the world's x, columns with y.
         height: (size, size) float32, metres above the table.
-        seen: (size, size) bool, whether the camera measured a point there; elsewhere colour and height are inferred.
+        seen: (size, size) bool, whether the camera measured a point; elsewhere colour and height are infilled.
     """
 
     rgb: NDArray[np.uint8]
@@ -45,18 +45,19 @@ def reproject(
 
     Args:
         rgb: (H, W, 3) uint8.
-        depth: (H, W) along the optical axis, float metres or integer millimetres; 0, negative or non-finite = invalid.
-        camera: its calibration.
-        workspace: the square on the table that is shown.
-        gripper: (5,) x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture. Where it is
-            given, points above the gripper, which are the arm's, are dropped.
-        options: of `ReprojectedView`, such as `size=128` or `infill="none"`.
+        depth: (H, W) depth along the optical axis, float metres or integer millimetres; 0, negative or non-finite =
+            invalid.
+        camera: calibrated camera of the images.
+        workspace: the square on the table that the view shows.
+        gripper: (5,) x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture in
+            [0, 1]. If given, points above the gripper, which belong to the arm, are removed.
+        options: options of `ReprojectedView`, such as `size=128` or `infill="none"`.
 
     Returns:
-        Colour, height and which pixels were seen.
+        Colour, height and the mask of measured pixels.
 
     Raises:
-        ValueError: if an image's shape or dtype is wrong, or there is no such option.
+        ValueError: if an image's shape or dtype is wrong, or an option is unknown.
 
     Example:
         ```python
@@ -75,29 +76,29 @@ def reproject(
 
 @dataclass(frozen=True)
 class ReprojectedView(View):
-    """RGBD reprojection: the frame's point cloud, projected orthographically from above (paper section 4.1)."""
+    """RGBD reprojection: a top-down orthographic projection of the frame's point cloud (paper section 4.1)."""
 
     size: int = 152
     """Rows and columns."""
     infill: Literal["nearest", "local", "none"] = "nearest"
-    """Fill of pixels without a point: the nearest point's (the paper's best), the mean of those nearby, or black."""
+    """Infill of pixels without a point: nearest point (the paper's best), mean of a 5 x 5 window, or none (black)."""
     clip: Literal["gripper", "none"] | float = "gripper"
-    """Drop points above the gripper, which removes the arm, where its state is known; `none` keeps all points; a number
-    drops those above that height, metres."""
+    """`gripper` removes points above the gripper, and with them the arm, if the gripper's state is known; `none` keeps
+    all points; a number removes points above that height, metres."""
     clip_margin: float = 0.01
-    """Metres below the gripper at which points are dropped, since the fingers reach below its position."""
+    """Distance of the clipping height below the gripper's position, metres, since the fingers reach below it."""
     clip_floor: float = 0.06
-    """Height in metres below which no point is dropped, so that what the gripper touches stays visible."""
+    """Lowest clipping height, metres, so that an object at the gripper stays visible."""
     source_scale: int = 1
-    """Upsample the depth image by this factor first, so that one surface leaves no gaps between its points."""
+    """Upsample the depth image by this factor first, so that surfaces have no gaps between their points."""
     height: bool = True
-    """Add `reproj_height`: metres above the table, one channel, which LeRobot's own policies do not take."""
+    """Add `reproj_height`: metres above the table, one channel, which LeRobot's own policies do not accept."""
     mask: bool = False
-    """Add `reproj_seen`: white where the camera measured a point, black where the image is inferred."""
+    """Add `reproj_seen`: white where the camera measured a point, black where the image is infilled."""
 
     @property
     def outputs(self) -> dict[str, Kind]:
-        """Colour, height above the table, and the mask."""
+        """Colour, height above the table, and the mask of measured pixels."""
         outputs: dict[str, Kind] = {"reproj": "rgb"}
         if self.height:
             outputs["reproj_height"] = "height"
@@ -107,12 +108,12 @@ class ReprojectedView(View):
 
     @property
     def needs_depth(self) -> bool:
-        """Always."""
+        """True: the point cloud comes from the depth image."""
         return True
 
     @property
     def uses_gripper(self) -> bool:
-        """Only to clip there."""
+        """True if points are clipped at the gripper's height."""
         return self.clip == "gripper"
 
     def __post_init__(self) -> None:
@@ -125,22 +126,22 @@ class ReprojectedView(View):
             if not math.isfinite(metres):
                 raise ValueError(f"{name} must be finite metres, got {metres}")
         if not isinstance(self.source_scale, Integral) or not 1 <= self.source_scale <= 8:
-            raise ValueError(f"source_scale must be a whole number in 1 to 8, got {self.source_scale}")
+            raise ValueError(f"source_scale must be an integer from 1 to 8, got {self.source_scale}")
 
     def without_gripper(self) -> ReprojectedView:
-        """Keep all points."""
+        """Return the view without clipping at the gripper."""
         return replace(self, clip="none") if self.uses_gripper else self
 
     def with_mask(self) -> ReprojectedView:
-        """Add `reproj_seen`."""
+        """Return the view with the output `reproj_seen`."""
         return replace(self, mask=True)
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return the outputs; black and 0 where nothing is known."""
-        from lerobot_symview.geometry import infill, upsampling, zbuffer  # numba: too slow for a plugin's import
+        """Return the outputs; black and height 0 where no point was measured or infilled."""
+        from lerobot_symview.geometry import infill, upsampling, zbuffer  # slow import: numba
 
         if frame.depth is None:
-            raise ValueError("the view 'reproj' needs depth; for a camera without it use 'persp'")
+            raise ValueError("the view 'reproj' needs depth; use 'persp' for a camera without depth")
         depth, camera, rgb = frame.depth, frame.camera, frame.rgb
         if self.source_scale > 1:
             depth, camera = upsampling.enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
@@ -149,7 +150,7 @@ class ReprojectedView(View):
             [depth], [camera], frame.workspace, self.size, self.ceiling(frame.gripper_height)
         )
         seen = buffer.source != zbuffer.EMPTY
-        shown = infill.nearest_known(seen) if self.infill == "nearest" else _every_cell(self.size)
+        shown = infill.nearest_known(seen) if self.infill == "nearest" else _identity_cells(self.size)
         colors, height = zbuffer.gather(shown, buffer, rgb.reshape(-1, 3))
         if self.infill == "local":
             colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)
@@ -159,7 +160,7 @@ class ReprojectedView(View):
         return {output: images[output] for output in self.outputs}
 
     def ceiling(self, gripper_height: float | None) -> float:
-        """Return the height above which points are dropped, metres; infinite where the gripper's height is unknown."""
+        """Return the height above which points are removed, metres; infinite if the gripper's height is unknown."""
         if self.clip == "gripper":
             return np.inf if gripper_height is None else max(gripper_height - self.clip_margin, self.clip_floor)
         return np.inf if self.clip == "none" else float(self.clip)
@@ -171,5 +172,5 @@ def _enlarged(camera: Camera, factor: int) -> Camera:
 
 
 @lru_cache(maxsize=8)
-def _every_cell(pixels: int) -> NDArray[np.int32]:
+def _identity_cells(pixels: int) -> NDArray[np.int32]:
     return np.arange(pixels**2, dtype=np.int32).reshape(pixels, pixels)

@@ -1,7 +1,7 @@
-"""Views of a batch of frames as torch tensors, on any device, bit-identical to rendering them one by one.
+"""Batched views as torch tensors, on any device, bit-identical to rendering the frames one by one.
 
-Every step is a separate operation in float64 or in integers, so that no device may fuse two and round differently. This
-is for GPUs: on a CPU the compiled kernels of `lerobot_symview.geometry` are faster.
+Every step is a separate operation in float64 or integers, so that no device fuses two steps and rounds differently.
+This backend is for GPUs: on a CPU the compiled kernels of `lerobot_symview.geometry` are faster.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.geometry.zbuffer import EMPTY, grid_from_pixel
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, check_gripper
 
-SOURCE_BITS = 31  # of a key: enough for any image's pixels, and with 32 for the height it fits a signed integer
+SOURCE_BITS = 31  # bits of a sort key for the pixel index; with 32 for the height the key fits a signed int64
 FRACTION = 32  # OpenCV's fixed-point steps per pixel
-INFILL_BYTES = 2**28  # of the largest intermediate
+INFILL_BYTES = 2**28  # size of the largest intermediate tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +30,13 @@ class FrameBatch:
 
     Args:
         rgb: (B, 3, H, W) uint8.
-        depth: (B, H, W) float32 metres, invalid as in `Frame`; None without a sensor.
-        cameras: B calibrations.
-        workspace: what the views show.
-        gripper: (B, 5) float32, as in `Frame`; None where it is not known.
+        depth: (B, H, W) float32, metres; invalid values as in `Frame`; None for RGB cameras.
+        cameras: B calibrated cameras.
+        workspace: the square on the table that the views show.
+        gripper: (B, 5) float32, as in `Frame`; None if unknown.
 
     Raises:
-        ValueError: if there is not one camera for each frame, or an image's size is not its camera's, or its type
-            another.
+        ValueError: if the number of cameras is not B, an image's size differs from its camera's, or a dtype is wrong.
     """
 
     rgb: Tensor
@@ -51,7 +50,7 @@ class FrameBatch:
         if self.rgb.shape != (count, 3, rows, columns) or self.rgb.dtype != torch.uint8:
             raise ValueError(f"rgb must be (B, 3, H, W) uint8, got {tuple(self.rgb.shape)} {self.rgb.dtype}")
         if len(self.cameras) != count:
-            raise ValueError(f"{count} frames need as many cameras, got {len(self.cameras)}")
+            raise ValueError(f"{count} frames need {count} cameras, got {len(self.cameras)}")
         sizes = {(camera.height, camera.width) for camera in self.cameras}
         if sizes - {(rows, columns)}:
             raise ValueError(f"rgb has {rows} x {columns} pixels, the cameras have {sorted(sizes)}")
@@ -65,7 +64,7 @@ class FrameBatch:
 
 
 def can_batch(view: View) -> bool:
-    """Whether `render_batch` makes this view: all but local infill, larger sources and views of others."""
+    """Whether `render_batch` supports this view: not `local` infill, `source_scale` above 1, or third-party views."""
     if isinstance(view, ReprojectedView):
         return view.infill != "local" and view.source_scale == 1
     return isinstance(view, PerspectiveView)
@@ -75,11 +74,10 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """Return every output of `view`: (B, 3, size, size) uint8 colour or (B, size, size) float32 metres.
 
     Raises:
-        ValueError: if `can_batch` is False, the frames lack depth that the view needs, or the gripper's state is not
-            finite.
+        ValueError: if `can_batch` is False, depth is required and missing, or the gripper's state is not finite.
     """
     if not can_batch(view):
-        raise ValueError(f"{view} is made frame by frame only")
+        raise ValueError(f"{view} can be rendered frame by frame only")
     if view.needs_depth and batch.depth is None:
         raise ValueError("the view needs depth")
     if isinstance(view, ReprojectedView):
@@ -113,14 +111,14 @@ def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
 def zbuffer_batch(
     depth: Tensor, cameras: list[Camera], workspace: Workspace, pixels: int, ceilings: list[float]
 ) -> tuple[Tensor, Tensor]:
-    """Draw depth images from above as `zbuffer_from_depth` does, each into a buffer of its own.
+    """Render each depth image into its own top-down z-buffer, as `zbuffer_from_depth` does.
 
     Args:
         depth: (B, H, W) float32, metres.
-        cameras: B calibrations.
-        workspace: what the buffers cover.
-        pixels: P, their side.
-        ceilings: B heights, metres, above which points are left out.
+        cameras: B calibrated cameras.
+        workspace: the square on the table that the buffers cover.
+        pixels: P, rows and columns of a buffer.
+        ceilings: B heights, metres, above which points are ignored.
 
     Returns:
         heights (B, P, P) float32 and sources (B, P, P) int64.
@@ -143,11 +141,11 @@ def zbuffer_batch(
     valid &= (row >= 0) & (column >= 0) & (row < pixels) & (column < pixels)
     cell = torch.where(valid, row, 0.0).long() * pixels + torch.where(valid, column, 0.0).long()
     heights = torch.where(valid, z, 0.0).float()
-    # One integer orders by height, then by earliest source: the greatest of a cell is its answer, whoever writes first.
+    # The key orders by height, then by lowest source, so that the maximum of a cell does not depend on the write order.
     index = torch.arange(rows * columns, device=depth.device).view(rows, columns)
     key = (_ordered(heights) << SOURCE_BITS) | (2**SOURCE_BITS - 1 - index)
     best = torch.zeros(count, pixels * pixels + 1, dtype=torch.int64, device=depth.device)
-    target = torch.where(valid, cell, pixels * pixels).flatten(1)  # the last cell takes what is left out
+    target = torch.where(valid, cell, pixels * pixels).flatten(1)  # the last cell collects the ignored points
     best = best.scatter_reduce(1, target, key.flatten(1), "amax")[:, :-1].view(count, pixels, pixels)
     source = torch.where(best > 0, 2**SOURCE_BITS - 1 - (best & (2**SOURCE_BITS - 1)), EMPTY)
     height = heights.flatten(1).gather(1, source.clamp(min=0).flatten(1)).view_as(source)
@@ -155,7 +153,7 @@ def zbuffer_batch(
 
 
 def _ordered(values: Tensor) -> Tensor:
-    """Map float32 to integers in (0, 2^32) that compare the same way."""
+    """Map float32 to integers in (0, 2^32) with the same order."""
     bits = (values + 0.0).view(torch.int32).long() & 0xFFFFFFFF  # adding 0 turns -0 into +0
     return torch.where(bits >> 31 == 1, 0xFFFFFFFF - bits, bits | (1 << 31))
 
@@ -174,7 +172,7 @@ def nearest_known_batch(known: Tensor) -> Tensor:
     best_column = torch.empty_like(row_of)
     chunk = max(1, INFILL_BYTES // (8 * count * columns * columns))
     for first in range(0, rows, chunk):
-        # [b, r, c, j] is the distance from (r, c) to column j's nearest, and after it j, which decides between equals
+        # [b, r, c, j]: squared distance from (r, c) to the nearest pixel of column j, then j itself, which breaks ties
         distance = (step[:, first : first + chunk, None, :] + across) * columns + c
         best_column[:, first : first + chunk] = distance.amin(-1) % columns
     best_row = row_of.gather(2, best_column)
@@ -188,8 +186,8 @@ def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
         for camera, height in zip(batch.cameras, heights, strict=True)
     ]
     device = batch.rgb.device
-    whole = torch.from_numpy(np.stack([one.whole for one in maps])).to(device).long()
-    fraction = torch.from_numpy(np.stack([one.fraction for one in maps]).astype(np.int64)).to(device)
+    whole = torch.from_numpy(np.stack([warp.whole for warp in maps])).to(device).long()
+    fraction = torch.from_numpy(np.stack([warp.fraction for warp in maps]).astype(np.int64)).to(device)
     right, down = fraction % FRACTION, fraction // FRACTION
     rows, columns = batch.rgb.shape[2:]
     total = torch.zeros(len(maps), 3, view.size, view.size, dtype=torch.int64, device=device)
@@ -212,6 +210,6 @@ def _gripper_heights(batch: FrameBatch) -> list[float | None]:
     if batch.gripper is None:
         return [None] * len(batch.rgb)
     states = batch.gripper.tolist()
-    for state in states:  # here, where a GPU is waited for anyway
+    for state in states:  # here, where .tolist() has synchronised with the GPU
         check_gripper(state)
     return [z for _, _, z, *_ in states]

@@ -1,4 +1,4 @@
-"""Requests for views of a dataset, the contents of a folder, and datasets that are changed."""
+"""Configurations of `add_views`, contents of folders, and modified datasets."""
 
 import json
 
@@ -28,7 +28,7 @@ def images_of(folder, key):
 
 
 def change_feature(folder, key, **entries):
-    """Change what a dataset declares about a feature."""
+    """Change a dataset's declaration of a feature."""
     file = folder / "meta" / "info.json"
     info = json.loads(file.read_text())
     info["features"][key] = info["features"].get(key, {}) | entries

@@ -1,4 +1,4 @@
-"""Packages of others, installed for as long as a test runs."""
+"""Registrations and third-party packages that exist for the duration of a test."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from symview_sim.tasks import TASKS
 
 @contextmanager
 def registered(names: registry.Registry[Any], name: str, item: Any) -> Iterator[None]:
-    """Register an item for as long as the block runs."""
+    """Register an item within the block."""
     names.register(name)(item)
     try:
         yield
@@ -23,7 +23,7 @@ def registered(names: registry.Registry[Any], name: str, item: Any) -> Iterator[
 
 @contextmanager
 def temporary_registrations() -> Iterator[None]:
-    """Forget what the block registers, and the entry points that it installs."""
+    """Undo registrations and installed entry points at the end of the block."""
     registries = (ENCODERS, TASKS, VIEWS)
     before = {names.kind: names.registered for names in registries}
     try:
@@ -36,12 +36,12 @@ def temporary_registrations() -> Iterator[None]:
 
 
 def install(folder: Path, name: str, entry_points: dict[str, dict[str, str]], monkeypatch) -> None:
-    """Make the modules in `folder` and their entry points importable, as pip does; clear `registry.installed` after."""
+    """Make the modules in `folder` and their entry points importable, as pip does, and clear `registry.installed`."""
     facts = folder / f"{name}-1.0.dist-info"
     facts.mkdir(parents=True)
     (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
     groups = (
-        f"[{group}]\n" + "".join(f"{one} = {place}\n" for one, place in added.items())
+        f"[{group}]\n" + "".join(f"{entry} = {target}\n" for entry, target in added.items())
         for group, added in entry_points.items()
     )
     (facts / "entry_points.txt").write_text("".join(groups))

@@ -1,4 +1,4 @@
-"""Policies small enough for tests, one for each method."""
+"""Small policies and training batches for tests."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ def make_actor(**options: Any) -> SymviewSacfdPolicy:
 
 
 def training_batch(config: SymviewConfig, batch: int = 4) -> dict[str, torch.Tensor]:
-    """An observation and actions of either sign, with nothing in common."""
+    """Random observations and unrelated random actions of either sign."""
     generator = torch.Generator().manual_seed(1)
     actions = torch.rand(batch, len(config.action_symmetry), generator=generator) - 0.5
     return example_observation(config, batch=batch) | {keys.ACTION: 0.1 * actions}

@@ -6,7 +6,7 @@ from lerobot.scripts import lerobot_train
 
 
 def train(monkeypatch, dataset, output, *options):
-    """Run two steps; a later option wins over an earlier one."""
+    """Train for two steps; return the folder of the policy. Later options override earlier ones."""
     command = [
         "lerobot-train",
         "--dataset.repo_id=test/recorded",

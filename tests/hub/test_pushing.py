@@ -84,7 +84,7 @@ def test_views_are_pushed_to_a_private_branch_with_their_parameters(hub, target,
 def test_a_broken_upload_is_resumed(hub, target):
     before = local_files(target.folder())
     hub.fail_uploads_after = 1
-    with pytest.raises(CommandError, match=r"broke off.*Nothing is lost.*--resume=true"):
+    with pytest.raises(CommandError, match=r"upload was interrupted.*Nothing is lost.*--resume=true"):
         push_dataset(target, target)
     assert before.items() <= local_files(target.folder()).items()
     hub.fail_uploads_after = None
@@ -96,8 +96,8 @@ def test_a_broken_upload_is_resumed(hub, target):
 @pytest.mark.parametrize(
     ("token", "message"),
     [
-        ("hf_unknown", "the Hub does not know the token: run `hf auth login` again"),
-        (BOB, "must not write to alice/picking: name a --dataset.repo_id of yours"),
+        ("hf_unknown", "the Hub rejects the token: run `hf auth login` again"),
+        (BOB, "has no write access to alice/picking: set --dataset.repo_id to a repository of yours"),
         (None, "`hf auth login`"),
     ],
 )
@@ -108,7 +108,7 @@ def test_a_refused_push_names_the_remedy(token, message, hub, target):
 
 
 def test_a_push_without_a_network_is_an_error(target, monkeypatch):
-    with pytest.raises(CommandError, match="HF_HUB_OFFLINE=1 keeps alice/picking from the Hub: unset it"):
+    with pytest.raises(CommandError, match="HF_HUB_OFFLINE=1 blocks the upload of alice/picking to the Hub: unset it"):
         push_dataset(target, target)
     with HubServer() as stopped, online(stopped, ALICE):
         stopped.__exit__(None, None, None)

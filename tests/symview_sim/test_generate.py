@@ -181,9 +181,9 @@ def test_an_interrupted_recording_needs_resume_and_the_same_request(small_shards
     _begun(tmp_path)
     with pytest.raises(CommandError, match="add --resume=true"):
         generate(config(tmp_path / "data"))
-    with pytest.raises(CommandError, match="begun with another features, seed"):
+    with pytest.raises(CommandError, match="run with different features, seed"):
         generate(config(tmp_path / "data", seed=1, resume=True))
-    with pytest.raises(CommandError, match="begun with another env, features"):
+    with pytest.raises(CommandError, match="run with different env, features"):
         generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
 
 

@@ -64,9 +64,9 @@ def test_gymnasium_makes_a_registered_task(wide_picking):
 def test_a_registered_name_is_suggested_and_cannot_be_taken_twice(wide_picking):
     with pytest.raises(ValueError, match="did you mean 'wide_picking'"):
         EnvSettings("wide_piking")
-    with pytest.raises(ValueError, match="a task named 'wide_picking' is registered already"):
+    with pytest.raises(ValueError, match="a task named 'wide_picking' is already registered"):
         register_task("wide_picking")
-    with pytest.raises(ValueError, match="a task named 'block_picking' is registered already"):
+    with pytest.raises(ValueError, match="a task named 'block_picking' is already registered"):
         register_task("block_picking")
 
 

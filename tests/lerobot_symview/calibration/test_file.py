@@ -22,7 +22,7 @@ def content(**changes):
 
 
 @pytest.mark.parametrize("write", [yaml.safe_dump, json.dumps])
-def test_a_file_is_yaml_or_json(tmp_path, write):
+def test_calibration_files_are_yaml_or_json(tmp_path, write):
     file = tmp_path / "cameras"
     file.write_text(write(content() | {"workspace": {"center": [0.5, 0.1], "size": 0.3}}))
     calibration = read_calibration(file)
@@ -31,7 +31,7 @@ def test_a_file_is_yaml_or_json(tmp_path, write):
     assert parse_calibration(plain_calibration(calibration)).workspace == calibration.workspace
 
 
-def test_poses_may_be_in_millimetres():
+def test_translations_in_millimetres_are_converted_to_metres():
     pose = make_camera(size=64).world_from_cam.copy()
     pose[:3, 3] *= 1000
     calibration = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": "mm"})
@@ -39,7 +39,7 @@ def test_poses_may_be_in_millimetres():
 
 
 @pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 1000.0)])
-def test_matrices_are_those_that_a_dataset_stores(units, scale):
+def test_matrices_are_rounded_to_the_float32_of_datasets(units, scale):
     pose = make_camera(17.0, 23.0, size=64).world_from_cam.copy()
     pose[:3, 3] *= scale
     parsed = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": units})
@@ -71,8 +71,8 @@ STRETCHED = np.diag([1.1, 1.0, 1.0, 1.0]).tolist()
         (content() | {"units": "inch"}, "units must be m or mm, got 'inch'"),
         ({"units": "m"}, "at least one camera"),
         (content() | {"cameras": {"front": {}}}, "lacks height, width, intrinsics, world_from_cam"),
-        (content(fov=3), "unknown fov"),
-        (content() | {"camera": 1}, "unknown camera"),
+        (content(fov=3), "unknown keys: fov"),
+        (content() | {"camera": 1}, "unknown keys: camera;"),
         (content(height=-3), "height must be a positive number of pixels, got -3"),
         (content(intrinsics=[[1, 0], [0, 1]]), "intrinsics must be 3 rows of 3 numbers"),
         (content(intrinsics=[[-60, 0, 31], [0, 60, 31], [0, 0, 1]]), "focal lengths must be positive"),
@@ -88,19 +88,19 @@ STRETCHED = np.diag([1.1, 1.0, 1.0, 1.0]).tolist()
         ),
     ],
 )
-def test_what_is_wrong_is_named(broken, message):
+def test_invalid_content_raises_an_error_that_names_the_problem(broken, message):
     with pytest.raises(CalibrationError, match=message):
         parse_calibration(broken)
 
 
-def test_everything_that_is_wrong_is_named_at_once():
+def test_one_error_lists_all_problems():
     broken = content(height=0) | {"units": "yard", "workspace": 3}
     with pytest.raises(CalibrationError, match=r"units.*camera 'front'.*workspace"):
         parse_calibration(broken)
 
 
 @pytest.mark.parametrize("text", ["units: [", "\x00"])
-def test_a_file_that_cannot_be_read_is_named(tmp_path, text):
+def test_an_unreadable_file_is_named_in_the_error(tmp_path, text):
     file = tmp_path / "cameras.yaml"
     file.write_text(text)
     with pytest.raises(CalibrationError, match=r"cannot read .*cameras\.yaml"):
@@ -109,6 +109,6 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, text):
         read_calibration(tmp_path / "nowhere.yaml")
 
 
-def test_an_unknown_camera_is_answered_with_the_known():
+def test_an_unknown_camera_error_lists_the_known_cameras():
     with pytest.raises(CalibrationError, match="no camera 'side'; it has front"):
         parse_calibration(content()).camera("side")

@@ -32,13 +32,13 @@ def parquet_columns(folder):
     return tables[0]
 
 
-def test_every_original_column_is_kept_bit_for_bit(recorded, with_views):
+def test_original_columns_are_bit_identical(recorded, with_views):
     before, after = parquet_columns(recorded), parquet_columns(with_views)
     for name in before.column_names:
         assert before[name].to_pylist() == after[name].to_pylist(), name
 
 
-def test_views_are_those_of_each_frame(recorded, with_views):
+def test_stored_views_equal_rendered_views(recorded, with_views):
     source = LeRobotDataset("test/recorded", root=recorded, depth_output_unit="m")
     result = LeRobotDataset("test/with_views", root=with_views, depth_output_unit="m")
     assert len(result) == len(source)
@@ -76,20 +76,20 @@ def test_statistics_cover_the_new_keys(with_views):
             np.testing.assert_allclose(np.squeeze(stats[key]["std"]), np.squeeze(values.std(axes)), rtol=1e-2)
 
 
-def test_the_statistics_of_depth_stay_in_metres(recorded, with_views):
+def test_depth_statistics_stay_in_metres(recorded, with_views):
     before, after = (json.loads((folder / "meta" / "stats.json").read_text()) for folder in (recorded, with_views))
     for key in (keys.depth("side"), keys.depth("top"), keys.ACTION):
         np.testing.assert_allclose(after[key]["max"], before[key]["max"])
 
 
-def test_a_view_says_how_it_was_made(with_views):
+def test_view_features_store_their_options_and_workspace(with_views):
     features = json.loads((with_views / "meta" / "info.json").read_text())["features"]
     made = features["observation.images.side_reproj"]["info"]["symview"]
     assert make_view(made["view"], **made["options"]) == make_view("reproj", size=VIEW_SIZE)
     assert made["workspace"] == {"center": [0.45, 0.0], "size": 0.4, "height_limit": 0.25}
 
 
-def test_keep_drops_the_other_images(only_views):
+def test_images_not_in_keep_are_dropped(only_views):
     dataset = LeRobotDataset("test/only_views", root=only_views)
     assert sorted(dataset.meta.camera_keys) == [
         "observation.images.side_reproj",
@@ -98,7 +98,7 @@ def test_keep_drops_the_other_images(only_views):
     assert keys.intrinsics("side") in dataset.meta.features
 
 
-def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, with_views):
+def test_the_source_is_not_modified_and_an_existing_target_not_overwritten(recorded, with_views):
     before = {path: path.read_bytes() for path in recorded.rglob("*") if path.is_file()}
     with pytest.raises(SymviewError, match="exists already"):
         add_views(AddViewsConfig(HubDataset("test/recorded", recorded), new_root=with_views))
@@ -113,7 +113,7 @@ def test_the_source_is_not_modified_and_the_target_not_overwritten(recorded, wit
         ({"dataset": HubDataset("no/where")}, DatasetError, "--dataset: there is no LeRobot dataset in"),
     ],
 )
-def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, options, error, message):
+def test_invalid_flags_raise_an_error_and_write_nothing(recorded, tmp_path, options, error, message):
     target = tmp_path / "target"
     config = AddViewsConfig(**({"dataset": HubDataset("test/recorded", recorded), "new_root": target} | options))
     with pytest.raises(error, match=message):
@@ -121,8 +121,8 @@ def test_a_mistake_is_named_and_leaves_nothing_behind(recorded, tmp_path, option
     assert list(tmp_path.iterdir()) == []
 
 
-def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
-    """Of lossless videos the views are those of the images; depth, stored in steps, moves few points."""
+def test_videos_are_copied_and_give_the_views_of_their_images(tmp_path):
+    """Lossless colour videos give identical views; quantised depth changes few points."""
     env = RecordedEnv(camera=CameraSpec(height=64, width=64), oracle=False)
     folders = {}
     for video in (False, True):
@@ -146,40 +146,40 @@ def test_videos_are_copied_and_seen_as_the_images_they_were(tmp_path):
     with pytest.raises(SymviewError, match=rf"lacks videos/{keys.depth('side')}/.*file-000\.mp4: download or copy"):
         add_views(views_config(source, tmp_path / "never"))
     assert not (tmp_path / "never.partial").exists()
-    add_views(views_config(source, tmp_path / "without_depth", views=["persp"], keep=[]))  # which that video is not for
+    add_views(views_config(source, tmp_path / "without_depth", views=["persp"], keep=[]))  # persp does not read depth
 
 
 @pytest.mark.parametrize("views", [[], ["reprojection"]])
-def test_unknown_views_are_refused_before_anything_is_read(views):
+def test_empty_or_unknown_views_are_rejected_by_the_configuration(views):
     with pytest.raises(ValueError, match=r"view"):
         AddViewsConfig(HubDataset("a/b"), views=views)
 
 
 @pytest.mark.parametrize("name", ["views", "me/", "a/b/c"])
-def test_a_wrong_name_of_the_result_names_its_flag(name):
+def test_an_invalid_new_repo_id_is_rejected(name):
     with pytest.raises(ValueError, match=f"--new_repo_id must look like user/name, got '{name}'"):
         AddViewsConfig(HubDataset("a/b"), new_repo_id=name)
 
 
-@pytest.mark.parametrize("place", ["source/views", "source/meta/views", "source", ".", "link/views"])
-def test_source_and_result_do_not_lie_in_each_other(recorded, tmp_path, place):
+@pytest.mark.parametrize("target", ["source/views", "source/meta/views", "source", ".", "link/views"])
+def test_source_and_result_inside_each_other_are_rejected(recorded, tmp_path, target):
     source = tmp_path / "source"
     shutil.copytree(recorded, source)
     (tmp_path / "link").symlink_to(source)
     before = contents(tmp_path)
-    with pytest.raises(ValueError, match="neither may lie in the other, choose another --new_root"):
-        add_views(views_config(source, tmp_path / place))
+    with pytest.raises(ValueError, match="neither may be inside the other, choose another --new_root"):
+        add_views(views_config(source, tmp_path / target))
     assert contents(tmp_path) == before
 
 
-def test_a_source_is_not_where_the_result_is_made(recorded, tmp_path):
+def test_a_source_inside_the_partial_folder_is_rejected(recorded, tmp_path):
     source = tmp_path / "views.partial" / "source"
     shutil.copytree(recorded, source)
     with pytest.raises(ValueError, match="choose another --new_root"):
         add_views(views_config(source, tmp_path / "views"))
 
 
-def test_lerobots_own_act_trains_on_what_is_made_for_stock_policies(recorded, tmp_path, monkeypatch):
+def test_lerobots_act_policy_trains_on_views_for_stock_policies(recorded, tmp_path, monkeypatch):
     source = views_config(recorded, tmp_path / "stock", for_stock_policies=True)
     dataset = LeRobotDataset("test/stock", root=add_views(source))
     assert set(dataset.meta.camera_keys) == {keys.view("side", name) for name in ("reproj", "persp", "persp_gripper")}
@@ -195,13 +195,13 @@ def test_lerobots_own_act_trains_on_what_is_made_for_stock_policies(recorded, tm
     assert (tmp_path / "act" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
 
 
-def test_a_camera_may_be_kept_for_stock_policies(recorded, tmp_path):
+def test_keep_adds_source_images_for_stock_policies(recorded, tmp_path):
     config = views_config(recorded, tmp_path / "stock", for_stock_policies=True, views=["reproj"], keep=["side"])
     images = LeRobotDataset("test/stock", root=add_views(config)).meta.camera_keys
     assert set(images) == {keys.rgb("side"), keys.view("side", "reproj")}
 
 
-def test_a_view_of_one_channel_is_refused_for_stock_policies():
+def test_a_one_channel_view_is_rejected_for_stock_policies():
     @dataclass(frozen=True)
     class Metres(View):
         size: int = 8
@@ -212,12 +212,12 @@ def test_a_view_of_one_channel_is_refused_for_stock_policies():
 
     with registered(VIEWS, "metres", Metres):
         AddViewsConfig(HubDataset("a/b"), views=["metres"])
-        with pytest.raises(ValueError, match=r"--for_stock_policies=true .* the view makes metres, which has one"):
+        with pytest.raises(ValueError, match=r"--for_stock_policies=true .* the view outputs metres, which has one"):
             AddViewsConfig(HubDataset("a/b"), views=["metres"], for_stock_policies=True)
 
 
-def test_views_of_any_package_take_options_on_the_command_line(recorded, tmp_path):
-    """A view's own options come before `--size`, which comes before dotted flags."""
+def test_list_options_override_size_and_dotted_flags(recorded, tmp_path):
+    """Options in `--views` override `--size`, which overrides dotted flags."""
     arguments = ["--dataset.repo_id=a/b", "--views=[reproj, {name: persp, plane_height: 0.025, size: 40}]", "--size=76"]
     config = draccus.parse(AddViewsConfig, args=[*arguments, "--reproj.infill=local", "--persp.gripper=false"])
     views = config.make_views()
@@ -227,12 +227,12 @@ def test_views_of_any_package_take_options_on_the_command_line(recorded, tmp_pat
         AddViewsConfig(HubDataset("a/b"), views=[ViewSpec("persp", {"plain_height": 1})])
 
 
-def test_a_dataset_without_gripper_dimensions_gets_unclipped_views_without_gripper(recorded, tmp_path, caplog):
+def test_without_gripper_dimensions_views_are_unclipped_and_have_no_gripper_image(recorded, tmp_path, caplog):
     source = tmp_path / "joints"
     shutil.copytree(recorded, source)
     change_feature(source, keys.STATE, names=[f"joint_{i}" for i in range(5)])
     result = add_views(views_config(source, tmp_path / "views"))
-    assert "made without clipping at the gripper" in caplog.text
+    assert "rendered without clipping at the gripper" in caplog.text
     features = SourceDataset(result).features
     assert keys.view("side", "persp_gripper") not in features
     assert features[keys.view("side", "reproj")]["info"]["symview"]["options"]["clip"] == "none"
@@ -245,7 +245,7 @@ def test_a_dataset_without_gripper_dimensions_gets_unclipped_views_without_gripp
 
 @pytest.mark.parametrize("declared", [True, False])
 def test_depth_in_float_millimetres_gives_the_same_views(recorded, tmp_path, declared, caplog):
-    """A unit that is not declared is inferred once for the dataset, and logged."""
+    """An undeclared unit is inferred once per dataset and logged."""
     caplog.set_level("INFO")
     source, key = tmp_path / "millimetres", keys.depth("side")
     shutil.copytree(recorded, source)
@@ -259,7 +259,7 @@ def test_depth_in_float_millimetres_gives_the_same_views(recorded, tmp_path, dec
 
 
 @pytest.mark.parametrize("file", ["meta/stats.json", "data/chunk-000/file-000.parquet"])
-def test_a_file_that_the_source_lacks_is_named_before_any_work(recorded, tmp_path, file):
+def test_a_missing_source_file_raises_an_error_before_any_output(recorded, tmp_path, file):
     source = tmp_path / "source"
     shutil.copytree(recorded, source)
     (source / file).unlink()

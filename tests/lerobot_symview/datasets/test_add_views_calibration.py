@@ -1,4 +1,4 @@
-"""Whose camera the views of a dataset are made by: the dataset's own, one that moves, one in a file; what they show."""
+"""Calibration of a dataset's views: stored with its frames, for fixed and moving cameras, or read from a file."""
 
 import json
 import re
@@ -40,8 +40,8 @@ from tests.helpers.datasets import images_of, views_config
 NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 
 
-def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
-    """A dataset without calibration gets the same views from a file, and the calibration with them."""
+def test_calibration_from_a_file_gives_the_same_views(recorded, with_views, tmp_path):
+    """A dataset without calibration gets the same views with a calibration file; the result stores the calibration."""
     source = LeRobotDataset("test/recorded", root=recorded)
     calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
     matrices = {key: source[0][key].tolist() for key in calibrations}
@@ -62,7 +62,7 @@ def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
     dataset = LeRobotDataset("test/derived", root=result)
     assert dataset[0][keys.world_from_cam("side")].tolist() == matrices[keys.world_from_cam("side")]
     assert dataset.meta.stats[keys.intrinsics("side")]["std"].tolist() == [0.0] * 9
-    with pytest.raises(ValueError, match=r"has observation\.camera\.side\.intrinsics.* already"):
+    with pytest.raises(ValueError, match=r"already has observation\.camera\.side\.intrinsics"):
         add_views(views_config(recorded, tmp_path / "never", calibration=file))
     file.write_text(yaml.safe_dump({"units": "m", "cameras": {"side": side | {"height": 76, "width": 76}}}))
     with pytest.raises(CalibrationError, match=r"principal point|152 x 152"):
@@ -70,7 +70,7 @@ def test_calibration_may_come_from_a_file(recorded, with_views, tmp_path):
     assert not list(tmp_path.glob("never*"))
 
 
-def test_a_camera_that_moves_is_followed(tmp_path):
+def test_a_camera_that_moves_between_episodes_is_followed(tmp_path):
     camera = CameraSpec(height=64, width=64, spread=CameraSpread(azimuth_deg=180.0, elevation_deg=20.0))
     env = RecordedEnv(camera=camera, oracle=False)
     target = NewDataset("test/recorded", tmp_path / "moving")
@@ -89,7 +89,7 @@ def test_a_camera_that_moves_is_followed(tmp_path):
 
 
 def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
-    """On a wrist, say: every frame's reprojection is made with the pose of that frame."""
+    """Every frame is reprojected with its own pose, as for a wrist camera."""
     source = LeRobotDataset.create(
         "test/wrist",
         fps=10,
@@ -109,7 +109,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         expected.append(view.render(Frame(rgb, depth, camera, Workspace())))
         frame = {keys.rgb("wrist"): rgb, keys.depth("wrist"): depth[..., None], keys.ACTION: np.zeros(1, np.float32)}
         calibration = {keys.intrinsics("wrist"): intrinsics.ravel(), keys.world_from_cam("wrist"): pose.ravel()}
-        source.add_frame(frame | calibration | {"task": "nothing"})
+        source.add_frame(frame | calibration | {"task": "none"})
     source.save_episode()
     source.finalize()
     config = views_config(
@@ -125,7 +125,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
 
 
 def record_real_robot(folder, camera, rgb, use_videos=False):
-    """Write three frames with joint angles and depth in uint16 millimetres, as a RealSense gives it; return that."""
+    """Record three frames with joint angles and RealSense depth in uint16 millimetres; return the depth."""
     size = (camera.height, camera.width)
     joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
     kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
@@ -151,14 +151,14 @@ def record_real_robot(folder, camera, rgb, use_videos=False):
     for _ in range(3):
         angles = rng.normal(size=6).astype(np.float32)
         frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
-        source.add_frame(frame | {"task": "nothing"})
+        source.add_frame(frame | {"task": "none"})
     source.save_episode()
     source.finalize()
     return depth
 
 
 @pytest.mark.parametrize("use_videos", [False, True])
-def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, use_videos):
+def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos):
     camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
     rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
     record_real_robot(tmp_path / "real", camera, rgb, use_videos)
@@ -179,7 +179,7 @@ def test_a_real_robots_dataset_needs_a_calibration_file_and_no_more(tmp_path, us
     assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
 
 
-def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_same_bits(tmp_path):
+def test_views_are_bit_identical_offline_online_and_from_stored_matrices(tmp_path):
     camera = Camera(intrinsics_from_fov(0.83, 96, 128), orbit_pose(0.91, 0.37, 0.81, (0.45, 0.01, 0.0)), 96, 128)
     rgb = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
     depth = record_real_robot(tmp_path / "real", camera, rgb)
@@ -213,7 +213,7 @@ def test_by_a_calibration_file_online_and_by_the_stored_matrices_views_are_the_s
                 np.testing.assert_array_equal(again, item[key].numpy(), err_msg=key)
 
 
-def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
+def test_an_invalid_pose_error_names_its_frame(recorded, tmp_path):
     source = tmp_path / "broken"
     shutil.copytree(recorded, source)
     file = next(source.rglob("data/**/*.parquet"))
@@ -227,7 +227,7 @@ def test_a_broken_calibration_names_its_frame(recorded, tmp_path):
         add_views(views_config(source, tmp_path / "derived"))
 
 
-def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
+def test_a_calibration_file_that_misses_the_workspace_is_rejected(recorded, tmp_path):
     camera = Camera(intrinsics_from_fov(0.8, 152, 152), orbit_pose(0.9, 0.4, 0.8, (2.0, 0.0, 0.0)), 152, 152)
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}))))
@@ -239,25 +239,25 @@ def test_a_stated_camera_that_sees_too_little_is_refused(recorded, tmp_path):
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_a_recorded_camera_that_sees_too_little_is_warned_of(recorded, tmp_path, caplog):
+def test_a_recorded_camera_that_misses_the_workspace_logs_a_warning(recorded, tmp_path, caplog):
     with caplog.at_level("WARNING", logger="lerobot_symview.datasets.add_views"):
         add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
-    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty where it sees nothing", caplog.text)
+    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty outside its image", caplog.text)
 
 
-def test_the_workspace_is_the_flags_then_the_files_then_the_datasets(recorded, tmp_path):
+def test_the_workspace_flag_overrides_the_file_and_the_dataset(recorded, tmp_path):
     bare, file = tmp_path / "bare", tmp_path / "cameras.json"
     source = LeRobotDataset("test/recorded", root=recorded)
     calibrations = [key for key in source.meta.features if key.startswith("observation.camera.")]
     modify_features(source, remove_features=calibrations, output_dir=bare, repo_id="test/bare")
     matrices = [source[0][key("side")].numpy() for key in (keys.intrinsics, keys.world_from_cam)]
     camera = stored_camera(*matrices, 152, 152)
-    stated, in_file, in_dataset = Workspace((0.5, 0.1), 0.3), Workspace(size=0.35), Workspace()
+    in_flag, in_file, in_dataset = Workspace((0.5, 0.1), 0.3), Workspace(size=0.35), Workspace()
     made = {}
     for name, data, workspace, more in (
-        ("flag", recorded, stated, {"workspace": stated}),
+        ("flag", recorded, in_flag, {"workspace": in_flag}),
         ("dataset", recorded, in_dataset, {}),
-        ("flag_before_file", bare, stated, {"workspace": stated, "calibration": file}),
+        ("flag_before_file", bare, in_flag, {"workspace": in_flag, "calibration": file}),
         ("file", bare, in_file, {"calibration": file}),
     ):
         file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}, in_file))))

@@ -1,4 +1,4 @@
-"""Parts, interruptions and processes: whatever happens, the same bytes."""
+"""Results are bit-identical for any number of processes, and after interruptions and crashes."""
 
 import os
 import shutil
@@ -26,19 +26,19 @@ from tests.helpers.files import largest_file
 
 @pytest.fixture
 def small_parts(monkeypatch):
-    """A part for every episode."""
+    """Cut one part per episode."""
     monkeypatch.setattr(derivation, "PART_FRAMES", 1)
 
 
 @pytest.fixture
 def reference(recorded, small_parts, tmp_path):
-    """What an undisturbed process writes."""
+    """Files written by one uninterrupted process."""
     return contents(add_views(views_config(recorded, tmp_path / "reference")))
 
 
 @pytest.fixture
 def several_files(recorded, tmp_path):
-    """A dataset of three times two episodes, in a file of their own each time, and so in three parts."""
+    """A dataset of three files with two episodes each, and so of three parts."""
     folder = tmp_path / "several"
     names = ["test/recorded"] * 3
     aggregate_datasets(names, "test/several", [recorded] * 3, folder, concatenate_data=False)
@@ -46,7 +46,7 @@ def several_files(recorded, tmp_path):
     return folder
 
 
-def test_the_number_of_processes_does_not_change_a_byte(recorded, reference, tmp_path):
+def test_the_result_does_not_depend_on_the_number_of_processes(recorded, reference, tmp_path):
     assert contents(add_views(views_config(recorded, tmp_path / "derived", num_workers=2))) == reference
 
 
@@ -55,23 +55,23 @@ def test_parts_are_cut_at_episodes_within_files(recorded, small_parts):
     assert derivation.cut_parts(source) == [range(0, 1), range(1, 2)]
 
 
-def test_an_interrupted_run_goes_on(recorded, reference, tmp_path, monkeypatch):
+def test_an_interrupted_run_is_resumed(recorded, reference, tmp_path, monkeypatch):
     target, written = tmp_path / "derived", []
 
-    def fail_at_the_second(one, part):
+    def fail_at_the_second(config, part):
         if written:
             raise KeyboardInterrupt
         written.append(part)
-        return derivation.write_part(one, part)
+        return derivation.write_part(config, part)
 
     with monkeypatch.context() as patched:
         patched.setattr("lerobot_symview.datasets.add_views.write_part", fail_at_the_second)
         with pytest.raises(KeyboardInterrupt):
             add_views(views_config(recorded, target))
     assert not target.exists()
-    with pytest.raises(CommandError, match="begun and interrupted: add --resume=true"):
+    with pytest.raises(CommandError, match="is from an interrupted run: add --resume=true"):
         add_views(views_config(recorded, target))
-    with pytest.raises(CommandError, match="begun with another views: repeat the command"):
+    with pytest.raises(CommandError, match="is from a run with different views: repeat that command"):
         add_views(views_config(recorded, target, size=VIEW_SIZE + 2, resume=True))
     kept = next((tmp_path / "derived.partial").rglob("*.parquet"))
     written_at = kept.stat().st_mtime_ns
@@ -79,7 +79,7 @@ def test_an_interrupted_run_goes_on(recorded, reference, tmp_path, monkeypatch):
     assert contents(target) == reference
     assert (target / kept.relative_to(tmp_path / "derived.partial" / "dataset")).stat().st_mtime_ns == written_at
     before = contents(target)
-    add_views(views_config(recorded, target, resume=True))  # complete already
+    add_views(views_config(recorded, target, resume=True))  # already complete
     assert contents(target) == before
     assert not (tmp_path / "derived.partial").exists()
 
@@ -108,8 +108,8 @@ for _ in sys.stdin:
 """
 
 
-def test_a_killed_process_loses_nothing_finished(recorded, reference, tmp_path):
-    """SIGKILL at random moments, a little later each time, until one run gets to the end."""
+def test_a_killed_process_keeps_finished_parts(recorded, reference, tmp_path):
+    """SIGKILL after a random, growing delay until one run completes."""
     target = tmp_path / "derived"
     rng, kills = np.random.default_rng(0), 0
     command = [sys.executable, "-c", FORKING, str(recorded), str(target)]
@@ -131,7 +131,7 @@ def test_a_killed_process_loses_nothing_finished(recorded, reference, tmp_path):
     assert kills > 0
 
 
-def test_a_full_disk_is_reported_and_the_run_goes_on_later(recorded, reference, tmp_path):
+def test_a_full_disk_raises_an_error_and_the_run_can_be_resumed(recorded, reference, tmp_path):
     target = tmp_path / "derived"
     with largest_file(30_000), pytest.raises(CommandError, match=r"cannot write to .*MiB free.*--resume=true"):
         add_views(views_config(recorded, target))
@@ -140,7 +140,7 @@ def test_a_full_disk_is_reported_and_the_run_goes_on_later(recorded, reference, 
     assert contents(target) == reference
 
 
-def test_tables_are_read_however_their_row_groups_are_cut(recorded, reference, tmp_path):
+def test_row_groups_may_be_of_any_size(recorded, reference, tmp_path):
     source = tmp_path / "recut"
     shutil.copytree(recorded, source)
     file = next(source.rglob("data/**/*.parquet"))
@@ -151,7 +151,7 @@ def test_tables_are_read_however_their_row_groups_are_cut(recorded, reference, t
             assert (result / path).read_bytes() == data
 
 
-def test_a_source_of_several_files_has_the_views_of_each(several_files, with_views, tmp_path):
+def test_a_source_of_several_files_gets_views_in_every_file(several_files, with_views, tmp_path):
     result = LeRobotDataset("test/derived", root=add_views(views_config(several_files, tmp_path / "derived")))
     once = LeRobotDataset("test/with_views", root=with_views)
     assert len(result) == 3 * len(once)
@@ -172,17 +172,17 @@ def test_a_source_of_several_files_has_the_views_of_each(several_files, with_vie
         assert episode in pq.read_table(result.root / place, columns=["episode_index"])["episode_index"].to_pylist()
 
 
-def test_two_killed_processes_lose_nothing_finished(several_files, tmp_path):
-    """SIGKILL before, amid and after the parts; then to the end, with the bytes of an undisturbed run."""
+def test_two_killed_worker_processes_keep_finished_parts(several_files, tmp_path):
+    """SIGKILL before and during the parts; the resumed run is bit-identical to an uninterrupted one."""
     target, partial = tmp_path / "derived", tmp_path / "derived.partial"
     command = [Path(sys.executable).parent / "symview-add-views", "--dataset.repo_id=test/recorded"]
     command += [f"--root={several_files}", "--new_repo_id=test/derived", f"--new_root={target}", "--resume=true"]
     command += ["--views=[reproj, persp]", f"--size={VIEW_SIZE}", "--num_workers=2"]
-    moments = [lambda: partial.exists(), lambda: any(partial.glob("dataset/data/*/*.parquet"))]
+    conditions = [lambda: partial.exists(), lambda: any(partial.glob("dataset/data/*/*.parquet"))]
     rng = np.random.default_rng(0)
-    for moment in moments:
+    for condition in conditions:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while not moment():
+        while not condition():
             assert process.poll() is None
             time.sleep(0.005)
         time.sleep(rng.uniform(0, 0.05))
@@ -191,4 +191,4 @@ def test_two_killed_processes_lose_nothing_finished(several_files, tmp_path):
         assert not target.exists()
     subprocess.run(command, check=True, capture_output=True)
     assert not partial.exists()
-    assert contents(target) == contents(add_views(views_config(several_files, tmp_path / "undisturbed")))
+    assert contents(target) == contents(add_views(views_config(several_files, tmp_path / "uninterrupted")))

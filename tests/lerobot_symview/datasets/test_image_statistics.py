@@ -25,7 +25,7 @@ def counted(kind, images):
 
 
 @pytest.mark.parametrize("kind", IMAGES)
-def test_statistics_are_numpys_over_all_pixels(kind):
+def test_statistics_equal_numpy_over_all_pixels(kind):
     values = np.stack(IMAGES[kind]).reshape(-1, 3 if kind == "rgb" else 1) / (255 if kind == "rgb" else 1)
     summary = image_summary(counted(kind, IMAGES[kind]).summary(), 5)
     assert summary["count"] == [5]
@@ -39,27 +39,27 @@ def test_statistics_are_numpys_over_all_pixels(kind):
 
 
 @pytest.mark.parametrize("kind", IMAGES)
-def test_parts_add_up_to_the_whole(kind):
+def test_merged_statistics_equal_those_of_all_images(kind):
     merged = counted(kind, IMAGES[kind][:2])
     merged.merge(counted(kind, IMAGES[kind][2:]))
     np.testing.assert_allclose(merged.summary(), counted(kind, IMAGES[kind]).summary(), rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", IMAGES)
-def test_many_summaries_are_lists_of_the_single_ones(kind):
+def test_stacked_summaries_equal_single_summaries(kind):
     summaries = [counted(kind, [image]).summary() for image in IMAGES[kind][:3]]
     many = image_summary(np.stack(summaries), [1, 2, 3])
     for index, summary in enumerate(summaries):
         assert image_summary(summary, index + 1) == {name: values[index] for name, values in many.items()}
 
 
-def test_heights_beyond_the_histogram_count_as_its_border():
+def test_heights_outside_the_histogram_count_in_its_border_bins():
     summary = image_summary(counted("height", [np.array([[-3.0, 0.0, 5.0]], dtype=np.float32)]).summary(), 1)
     assert (np.ravel(summary["min"]), np.ravel(summary["max"])) == (-3.0, 5.0)
     np.testing.assert_allclose([np.ravel(summary["q01"]), np.ravel(summary["q99"])], [[LOWEST], [HIGHEST]])
 
 
-def test_a_constant_has_no_deviation():
+def test_a_constant_feature_has_zero_deviation():
     summary = constant_summary(np.array([1.0, 2.0]), 7)
     assert (summary["mean"], summary["std"], summary["q50"], summary["count"]) == (
         [1.0, 2.0],

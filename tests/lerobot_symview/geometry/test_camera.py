@@ -16,7 +16,7 @@ from tests.helpers.cameras import make_camera
 POSES = [(45, 0), (15, 90), (75, -130), (90, 0)]
 
 
-def test_orbit_pose_from_straight_above_has_rows_along_x_and_columns_along_y():
+def test_orbit_pose_at_90_degrees_has_rows_along_x_and_columns_along_y():
     world_from_cam = orbit_pose(np.pi / 2, 0.0, 1.0, (0, 0, 0))
     expected = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]]
     np.testing.assert_allclose(world_from_cam, expected, atol=1e-12)
@@ -41,13 +41,13 @@ def test_unproject_inverts_project(elevation, azimuth):
     np.testing.assert_allclose(again, depth, atol=1e-12)
 
 
-def test_depth_is_measured_along_the_axis_not_along_the_ray():
+def test_depth_is_along_the_optical_axis_not_the_ray():
     camera = make_camera(90.0)
     points = unproject(np.full((152, 152), 0.81), camera)
     np.testing.assert_allclose(points[..., 2], 0.0, atol=1e-12)
 
 
-def test_the_field_of_view_ends_at_the_edge_of_the_border_pixels():
+def test_the_field_of_view_spans_the_outer_edges_of_the_border_pixels():
     intrinsics = intrinsics_from_fov(np.pi / 2, 10, 10)
     edge = intrinsics @ [1.0, 0.0, 1.0]  # 45 degrees to the right
     assert edge[0] == pytest.approx(9.5)
@@ -72,12 +72,12 @@ def test_invert_rigid_and_transform_agree():
         (lambda k, t: (k, t[:3]), "shape"),
     ],
 )
-def test_a_wrong_calibration_is_refused_with_the_reason(change, message):
+def test_invalid_calibrations_are_rejected(change, message):
     camera = make_camera()
     with pytest.raises(CalibrationError, match=message):
         Camera(*change(camera.intrinsics, camera.world_from_cam), 152, 152)
 
 
-def test_all_problems_are_named_at_once():
+def test_one_error_lists_all_problems():
     with pytest.raises(CalibrationError, match=r"focal lengths.*orthonormal"):
         Camera(np.diag([-1.0, 1.0, 1.0]), 2 * np.eye(4), 10, 10)

@@ -10,7 +10,7 @@ from lerobot_symview.geometry.workspace import Workspace
 STATE = np.array([0.06, -0.03, 0.1, 0.4, 0.7])
 
 
-def test_fingers_stand_at_the_opening_and_carry_the_height(workspace):
+def test_fingers_have_the_gripper_height_and_opening(workspace):
     image = gripper_image(np.array([0.0, 0.0, 0.125, 0.0, 1.0]), workspace, 160)
     shape = GripperShape()
     assert image.max() == pytest.approx(0.5)  # half of the height limit
@@ -22,23 +22,23 @@ def test_fingers_stand_at_the_opening_and_carry_the_height(workspace):
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
-def test_turning_the_gripper_turns_its_image(workspace, quarter_turns):
+def test_rotating_the_gripper_rotates_its_image(workspace, quarter_turns):
     angle = quarter_turns * np.pi / 2
     x, y, z, yaw, aperture = STATE
-    turned = np.array(
+    rotated = np.array(
         [x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle), z, yaw + angle, aperture]
     )
     expected = np.rot90(gripper_image(STATE, workspace, 76), quarter_turns)
-    np.testing.assert_allclose(gripper_image(turned, workspace, 76), expected, atol=1e-12)
+    np.testing.assert_allclose(gripper_image(rotated, workspace, 76), expected, atol=1e-12)
 
 
-def test_mirroring_the_gripper_mirrors_its_image(workspace):
-    mirrored = STATE * [1, -1, 1, -1, 1]
+def test_reflecting_the_gripper_reflects_its_image(workspace):
+    reflected = STATE * [1, -1, 1, -1, 1]
     expected = gripper_image(STATE, workspace, 76)[:, ::-1]
-    np.testing.assert_allclose(gripper_image(mirrored, workspace, 76), expected, atol=1e-12)
+    np.testing.assert_allclose(gripper_image(reflected, workspace, 76), expected, atol=1e-12)
 
 
-def test_half_a_turn_of_yaw_changes_nothing(workspace):
+def test_yaw_is_periodic_in_half_a_turn(workspace):
     np.testing.assert_allclose(
         gripper_image(STATE + [0, 0, 0, np.pi, 0], workspace, 76), gripper_image(STATE, workspace, 76), atol=1e-12
     )
@@ -55,11 +55,11 @@ def test_a_gripper_outside_the_workspace_is_not_drawn(workspace):
     assert gripper_image(STATE + [1, 0, 0, 0, 0], workspace, 76).max() == 0
 
 
-PLACES = st.floats(-0.3, 0.3)
+POSITIONS = st.floats(-0.3, 0.3)
 
 
-@given(x=PLACES, y=PLACES, z=st.floats(0, 0.4), yaw=st.floats(-4, 4), aperture=st.floats(0, 1))
-def test_the_picture_is_the_image_in_grey_levels(x, y, z, yaw, aperture):
+@given(x=POSITIONS, y=POSITIONS, z=st.floats(0, 0.4), yaw=st.floats(-4, 4), aperture=st.floats(0, 1))
+def test_the_uint8_image_is_the_float_image_in_grey_levels(x, y, z, yaw, aperture):
     state = np.array([x, y, z, yaw, aperture])
     image = gripper_image(state, Workspace(), 76)
     np.testing.assert_array_equal(

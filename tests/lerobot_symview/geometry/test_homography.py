@@ -8,24 +8,24 @@ from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera, project, stored_camera
 from lerobot_symview.geometry.homography import camera_direction, image_from_topdown, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
-from tests.helpers.cameras import cameras, make_camera, moved, moved_picture, world_motion
+from tests.helpers.cameras import cameras, make_camera, transformed, transformed_image, world_transform
 
 POSES = [(45, 0), (15, 60), (75, -100), (90, 0)]
 
 
 @pytest.mark.parametrize("height", [0.0, 0.025, 0.1])
 @pytest.mark.parametrize(("elevation", "azimuth"), POSES)
-def test_the_homography_is_the_one_opencv_solves_for_from_the_corners(workspace, elevation, azimuth, height):
+def test_the_homography_equals_opencvs_solution_from_the_corners(workspace, elevation, azimuth, height):
     camera = make_camera(elevation, azimuth)
-    seen, _ = project(workspace.corners(height), camera)
+    projected, _ = project(workspace.corners(height), camera)
     flat = np.array([[-0.5, -0.5], [151.5, -0.5], [151.5, 151.5], [-0.5, 151.5]])  # TL, TR, BR, BL as (u, v)
-    solved = cv2.getPerspectiveTransform(flat.astype(np.float32), seen.astype(np.float32))
+    solved = cv2.getPerspectiveTransform(flat.astype(np.float32), projected.astype(np.float32))
     ours = image_from_topdown(camera, workspace, 152, height)
     np.testing.assert_allclose(ours / ours[2, 2], solved, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize(("elevation", "azimuth"), POSES)
-def test_table_points_land_on_their_pixels(workspace, elevation, azimuth):
+def test_table_points_map_to_their_projections(workspace, elevation, azimuth):
     camera = make_camera(elevation, azimuth)
     row, column = workspace.pixel_from_xy(np.array([0.53, -0.12]), 76)
     u, v, w = image_from_topdown(camera, workspace, 76) @ [column, row, 1]
@@ -33,7 +33,7 @@ def test_table_points_land_on_their_pixels(workspace, elevation, azimuth):
     np.testing.assert_allclose([u / w, v / w], pixel, atol=1e-9)
 
 
-def test_a_camera_at_the_oracles_place_is_left_unchanged(workspace):
+def test_the_warp_of_a_top_down_camera_is_the_identity(workspace):
     size = 60
     fov = 2 * np.rad2deg(np.arctan(workspace.size / 2 / 0.81))
     camera = make_camera(90.0, size=size, fov=fov)
@@ -42,7 +42,7 @@ def test_a_camera_at_the_oracles_place_is_left_unchanged(workspace):
 
 
 @given(camera=cameras((60, 80)), height=st.floats(0.0, 0.05))
-def test_corners_of_the_view_are_corners_of_the_workspace_to_a_thousandth_of_a_pixel(camera, height):
+def test_view_corners_map_to_workspace_corners_within_a_thousandth_of_a_pixel(camera, height):
     workspace, pixels = Workspace(), 76
     corners = workspace.corners(height)
     assume((project(corners, camera)[1] > 0).all())
@@ -52,8 +52,8 @@ def test_corners_of_the_view_are_corners_of_the_workspace_to_a_thousandth_of_a_p
 
 
 @given(camera=cameras((60, 80)))
-def test_warping_samples_like_the_homography(camera):
-    """Each pixel is the bilinear mean of the image where the homography says, within OpenCV's steps of 1/32 pixel."""
+def test_the_warp_samples_where_the_homography_maps(camera):
+    """Each pixel is interpolated bilinearly at its homography's image point, within OpenCV's steps of 1/32 pixel."""
     workspace, pixels = Workspace(), 30
     assume((project(workspace.corners(), camera)[1] > 0).all())
     ramp = np.add.outer(np.arange(60) * 2.0, np.arange(80) * 1.5)  # linear, so that it can be evaluated anywhere
@@ -68,35 +68,35 @@ def test_warping_samples_like_the_homography(camera):
     assert not warped[outside].any()
 
 
-@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("reflect", [False, True])
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 @given(camera=cameras((60, 80)), height=st.floats(0.0, 0.05))
-def test_moving_world_and_camera_moves_the_sampled_points(quarter_turns, mirror, camera, height):
+def test_transforming_world_and_camera_transforms_the_sampled_points(quarter_turns, reflect, camera, height):
     workspace, pixels = Workspace(), 20
     assume((project(workspace.corners(height), camera)[1] > 0).all())
     labels = np.arange(pixels**2).reshape(pixels, pixels)
 
-    def sampled(one):
+    def sampled(camera):
         columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
         flat = np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
-        u, v, w = image_from_topdown(one, workspace, pixels, height) @ flat
+        u, v, w = image_from_topdown(camera, workspace, pixels, height) @ flat
         return np.column_stack([u / w, v / w])
 
-    there, _ = moved(camera, np.zeros((60, 80)), quarter_turns, mirror)
-    expected = sampled(camera)[moved_picture(labels, quarter_turns, mirror).ravel()]
-    if mirror:
+    transformed_camera, _ = transformed(camera, np.zeros((60, 80)), quarter_turns, reflect)
+    expected = sampled(camera)[transformed_image(labels, quarter_turns, reflect).ravel()]
+    if reflect:
         expected[:, 0] = camera.width - 1 - expected[:, 0]
-    np.testing.assert_allclose(sampled(there), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(sampled(transformed_camera), expected, rtol=1e-6, atol=1e-6)
 
 
-def test_maps_are_kept_for_cameras_that_stay(workspace):
+def test_maps_of_unchanged_cameras_are_cached(workspace):
     arrays = make_camera().intrinsics.astype(np.float32), make_camera().world_from_cam.astype(np.float32)
     first, second = (stored_camera(*(array.copy() for array in arrays), 152, 152) for _ in range(2))
     assert warp_map(first, workspace, 76) is warp_map(second, workspace, 76)
     assert warp_map(first, workspace, 76) is not warp_map(first, workspace, 76, 0.01)
 
 
-def test_a_camera_that_cannot_see_the_plane_is_refused(workspace):
+def test_a_plane_behind_the_camera_is_rejected(workspace):
     inside = make_camera(45.0)
     pose = inside.world_from_cam.copy()
     pose[:3, 3] = [0.45, 0.0, 0.05]
@@ -111,14 +111,14 @@ def test_camera_direction_points_from_the_centre_to_the_camera(workspace, azimut
     np.testing.assert_allclose(camera_direction(make_camera(45, azimuth), workspace), direction, atol=1e-12)
 
 
-def test_camera_direction_is_zero_straight_above(workspace):
+def test_camera_direction_is_zero_above_the_centre(workspace):
     np.testing.assert_allclose(camera_direction(make_camera(90), workspace), 0, atol=1e-12)
 
 
-@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("reflect", [False, True])
 @pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
 @given(camera=cameras())
-def test_camera_direction_turns_and_mirrors_with_the_world(quarter_turns, mirror, camera):
-    there, _ = moved(camera, np.zeros((40, 56)), quarter_turns, mirror)
-    expected = world_motion(quarter_turns, mirror)[:2, :2] @ camera_direction(camera, Workspace())
-    np.testing.assert_allclose(camera_direction(there, Workspace()), expected, atol=1e-9)
+def test_camera_direction_transforms_with_the_world(quarter_turns, reflect, camera):
+    transformed_camera, _ = transformed(camera, np.zeros((40, 56)), quarter_turns, reflect)
+    expected = world_transform(quarter_turns, reflect)[:2, :2] @ camera_direction(camera, Workspace())
+    np.testing.assert_allclose(camera_direction(transformed_camera, Workspace()), expected, atol=1e-9)

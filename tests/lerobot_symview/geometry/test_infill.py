@@ -8,7 +8,7 @@ from tests.helpers.cameras import MASKS
 
 
 def slow_nearest(known):
-    """Every known pixel compared; of equally near ones the leftmost, then the uppermost."""
+    """Brute-force reference; ties go to the leftmost column, then to the uppermost row."""
     candidates = sorted(map(tuple, np.argwhere(known)), key=lambda pixel: (pixel[1], pixel[0]))
     nearest = np.empty(known.shape, dtype=np.int64)
     for r in range(known.shape[0]):
@@ -19,7 +19,7 @@ def slow_nearest(known):
 
 
 @given(known=MASKS)
-def test_nearest_known_equals_its_definition_with_its_rule_for_ties(known):
+def test_nearest_known_equals_the_reference_including_ties(known):
     expected = slow_nearest(known) if known.any() else np.full(known.shape, -1)
     np.testing.assert_array_equal(nearest_known(known), expected)
 
@@ -31,17 +31,17 @@ def distances(known):
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 @given(known=MASKS.filter(np.any))
-def test_turning_the_image_turns_the_distances(quarter_turns, known):
-    turned = distances(np.ascontiguousarray(np.rot90(known, quarter_turns)))
-    np.testing.assert_allclose(turned, np.rot90(distances(known), quarter_turns), atol=1e-12)
+def test_rotating_the_mask_rotates_the_distances(quarter_turns, known):
+    rotated = distances(np.ascontiguousarray(np.rot90(known, quarter_turns)))
+    np.testing.assert_allclose(rotated, np.rot90(distances(known), quarter_turns), atol=1e-12)
 
 
-def test_distances_in_a_large_image_are_scipys():
+def test_distances_in_a_large_image_equal_scipys():
     known = np.random.default_rng(0).random((300, 200)) < 0.001
     np.testing.assert_allclose(distances(known), ndimage.distance_transform_edt(~known), atol=1e-9)
 
 
-def test_fill_local_averages_the_neighbourhood_and_leaves_large_holes():
+def test_fill_local_averages_the_window_and_keeps_large_holes():
     image = np.zeros((20, 20), dtype=np.float32)
     known = np.zeros((20, 20), dtype=bool)
     image[2, 2], image[2, 4] = 1.0, 3.0
@@ -53,7 +53,7 @@ def test_fill_local_averages_the_neighbourhood_and_leaves_large_holes():
     assert (filled[known] == image[known]).all()
 
 
-def test_fill_local_treats_colours_alike_and_rounds_them():
+def test_fill_local_treats_channels_independently_and_rounds():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (12, 12, 3), dtype=np.uint8)
     known = rng.random((12, 12)) < 0.3

@@ -9,12 +9,12 @@ SPREAD = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0, distance=0.1, targe
 
 
 @pytest.mark.parametrize("elevation", [15, 30, 45, 60, 75])
-def test_the_default_camera_sees_the_whole_working_volume(workspace, elevation):
+def test_the_default_camera_shows_the_whole_working_volume(workspace, elevation):
     camera = CameraSpec(elevation_deg=elevation).place(workspace)
     assert workspace.visible_fraction(camera) == 1.0
 
 
-def test_a_camera_that_looks_elsewhere_is_refused_with_the_fraction_it_sees(workspace):
+def test_a_camera_that_misses_the_workspace_is_rejected_with_the_visible_fraction(workspace):
     with pytest.raises(ValueError, match=r"sees \d+% of the workspace"):
         CameraSpec(fov_deg=8.0).place(workspace)
 
@@ -33,22 +33,22 @@ def test_a_camera_that_looks_elsewhere_is_refused_with_the_fraction_it_sees(work
     ],
     ids=lambda f: str(f),
 )
-def test_impossible_placements_are_refused(fields):
+def test_invalid_placements_are_rejected(fields):
     with pytest.raises(ValueError, match=next(iter(fields))):
         CameraSpec(**fields)
 
 
-def test_a_negative_spread_is_refused():
+def test_a_negative_spread_is_rejected():
     with pytest.raises(ValueError, match="negative"):
         CameraSpread(distance=-0.1)
 
 
-def test_a_spread_as_large_as_the_distance_is_refused():
+def test_a_spread_as_large_as_the_distance_is_rejected():
     with pytest.raises(ValueError, match=r"spread\.distance must be smaller than distance"):
         CameraSpec(spread=CameraSpread(distance=0.9))
 
 
-def test_elevations_are_drawn_uniformly_below_the_zenith(workspace):
+def test_elevations_are_sampled_uniformly_up_to_90_degrees(workspace):
     spec = CameraSpec(elevation_deg=80.0, spread=CameraSpread(elevation_deg=30.0))
     rng = np.random.default_rng(0)
     poses = [spec.place(workspace, rng).position - [*workspace.center, 0.0] for _ in range(200)]
@@ -57,12 +57,12 @@ def test_elevations_are_drawn_uniformly_below_the_zenith(workspace):
     assert len(set(elevations)) == 200
 
 
-def test_a_pose_by_matrix_cannot_spread():
+def test_a_spread_with_a_pose_matrix_is_rejected():
     with pytest.raises(ValueError, match="spread needs a pose by angles"):
         CameraSpec(world_from_cam=tuple(np.eye(4).ravel()), spread=SPREAD)
 
 
-def test_matrices_say_the_same_as_angles(workspace):
+def test_matrices_and_angles_give_the_same_camera(workspace):
     by_angles = CameraSpec(elevation_deg=30.0, azimuth_deg=40.0, target=(0.02, -0.01, 0.03)).place(workspace)
     matrices = {
         "intrinsics": tuple(by_angles.intrinsics.ravel()),
@@ -73,7 +73,7 @@ def test_matrices_say_the_same_as_angles(workspace):
     np.testing.assert_array_equal(by_matrices.world_from_cam, by_angles.world_from_cam)
 
 
-def test_a_matrix_that_is_not_a_camera_is_refused(workspace):
+def test_an_invalid_pose_matrix_is_rejected(workspace):
     with pytest.raises(CalibrationError, match="reflection"):
         CameraSpec(world_from_cam=tuple(np.diag([-1.0, 1.0, 1.0, 1.0]).ravel())).place(workspace)
 
@@ -85,7 +85,7 @@ def test_the_camera_looks_at_its_target(workspace):
     assert depth == pytest.approx(spec.distance)
 
 
-def test_a_spread_draws_poses_within_its_ranges_that_see_the_workspace(workspace):
+def test_sampled_poses_are_within_the_spread_and_show_the_workspace(workspace):
     spec = CameraSpec(elevation_deg=50.0, distance=0.9, spread=SPREAD)
     rng = np.random.default_rng(0)
     cameras = [spec.place(workspace, rng) for _ in range(200)]
@@ -103,20 +103,20 @@ def test_a_spread_draws_poses_within_its_ranges_that_see_the_workspace(workspace
     assert min(workspace.visible_fraction(camera) for camera in cameras) >= 0.6
 
 
-def test_a_spread_that_never_sees_the_workspace_is_refused(workspace):
+def test_a_spread_without_a_pose_that_shows_the_workspace_is_rejected(workspace):
     spec = CameraSpec(fov_deg=8.0, spread=SPREAD)
     with pytest.raises(ValueError, match="of the workspace"):
         spec.place(workspace, np.random.default_rng(0))
 
 
-def test_without_a_spread_nothing_is_drawn(workspace):
+def test_without_a_spread_the_pose_is_the_nominal_one(workspace):
     np.testing.assert_array_equal(
         CameraSpec().place(workspace, np.random.default_rng(0)).world_from_cam,
         CameraSpec().place(workspace).world_from_cam,
     )
 
 
-def test_the_oracle_frames_the_table_square_exactly(workspace):
+def test_the_oracle_camera_shows_exactly_the_workspace(workspace):
     camera = top_camera(100, workspace).place(workspace)
     pixels, _ = project(workspace.corners(), camera)
     np.testing.assert_allclose(pixels, [[-0.5, -0.5], [99.5, -0.5], [99.5, 99.5], [-0.5, 99.5]], atol=1e-6)

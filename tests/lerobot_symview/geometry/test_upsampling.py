@@ -10,11 +10,11 @@ from tests.helpers.cameras import cameras, make_camera, plane_depth
 @pytest.mark.parametrize("factor", [1, 2, 3, 5])
 @given(camera=cameras())
 def test_planes_are_interpolated_exactly(factor, camera):
-    """Wherever neighbours differ by little, that is: elsewhere, as beyond the horizon, the pixel's own depth stays."""
+    """Exact where neighbouring depths differ little; at larger steps, as at the horizon, depths are repeated."""
     depth = plane_depth(camera)
     enlarged = enlarge_depth(depth, factor)
     exact = plane_depth(camera.enlarged(factor))
-    inner = slice(factor, -factor)  # half a pixel at the border would have to be extrapolated
+    inner = slice(factor, -factor)  # the border would need extrapolation by half a pixel
     repeated = depth.repeat(factor, axis=0).repeat(factor, axis=1)
     interpolated = np.isclose(enlarged, exact, rtol=1e-5)
     kept = np.isclose(enlarged, repeated, rtol=1e-6)
@@ -25,13 +25,13 @@ def test_planes_are_interpolated_exactly(factor, camera):
     assert interpolated[inner, inner][smooth[inner, inner]].all()
 
 
-def test_a_step_stays_a_step():
+def test_depth_steps_are_not_interpolated():
     depth = np.where(np.arange(8) < 4, 0.8, 0.9)[None].repeat(6, axis=0)
     assert set(np.unique(enlarge_depth(depth, 3))) == {np.float32(0.8), np.float32(0.9)}
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
-def test_invalid_depth_stays_invalid_and_where_it_was(bad):
+def test_invalid_pixels_stay_invalid_in_place(bad):
     depth = np.full((5, 5), 0.8)
     depth[2, 2] = bad
     enlarged = enlarge_depth(depth, 4)
@@ -41,14 +41,14 @@ def test_invalid_depth_stays_invalid_and_where_it_was(bad):
 
 
 @given(rows=st.integers(1, 4), columns=st.integers(1, 4), factor=st.integers(1, 4))
-def test_images_of_any_size_are_enlarged(rows, columns, factor):
+def test_images_of_any_size_are_upsampled(rows, columns, factor):
     np.testing.assert_allclose(enlarge_depth(np.full((rows, columns), 0.5), factor), 0.5)
 
 
-def test_the_enlarged_camera_sees_the_same_field():
+def test_the_enlarged_camera_has_the_same_field_of_view():
     camera = make_camera(size=10)
     big = camera.enlarged(3)
-    # edges of the image, half a pixel outside its border pixels, stay where they were
+    # the image's edges, half a pixel outside the centres of the border pixels, do not move
     for small_edge, big_edge in ((-0.5, -0.5), (9.5, 29.5)):
         here = (small_edge - camera.intrinsics[0, 2]) / camera.intrinsics[0, 0]
         there = (big_edge - big.intrinsics[0, 2]) / big.intrinsics[0, 0]

@@ -19,6 +19,6 @@ def test_rows_grow_with_x_and_columns_with_y(workspace):
     assert row > column > 75.5
 
 
-def test_a_workspace_without_extent_is_refused():
+def test_a_workspace_of_size_zero_is_rejected():
     with pytest.raises(ValueError, match="positive"):
         Workspace(size=0.0)

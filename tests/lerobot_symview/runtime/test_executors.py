@@ -1,4 +1,4 @@
-"""Processes that do work, and the server they are forked from."""
+"""Worker processes and their fork server."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ with ProcessExecutor(1, "lerobot_symview.datasets.derivation") as executor:
 """
 
 
-def test_ctrl_c_is_left_to_the_process_that_started_the_others():
-    """The server imports for seconds, in which an interrupt would end it with a traceback."""
+def test_the_fork_server_ignores_ctrl_c():
+    """The fork server's imports take seconds; an interrupt meanwhile would end it with a traceback."""
     done = subprocess.run([sys.executable, "-c", INTERRUPT], capture_output=True, text=True, timeout=120)
     assert (done.stdout, done.stderr) == ("[1]\n", "")

@@ -1,4 +1,4 @@
-"""What is removed, gone on with, or left alone in `<target>.partial`."""
+"""Files in `<target>.partial` that are removed, resumed or never modified."""
 
 import shutil
 from pathlib import Path
@@ -20,44 +20,44 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("resume", [False, True])
 @pytest.mark.parametrize("name", ["notes.txt", REQUEST, "dataset/photo.png"])
-def test_what_somebody_keeps_there_is_left_alone(recorded, tmp_path, name, resume):
+def test_foreign_files_in_the_partial_folder_are_not_modified(recorded, tmp_path, name, resume):
     kept = tmp_path / "derived.partial" / name
     kept.parent.mkdir(parents=True)
-    kept.write_text("years of work")
-    with pytest.raises(CommandError, match=rf"no command of ours put there \({Path(name).parts[0]}\): move it"):
+    kept.write_text("user data")
+    with pytest.raises(CommandError, match=rf"not created by an earlier run \({Path(name).parts[0]}\): move it"):
         add_views(views_config(recorded, tmp_path / "derived", resume=resume))
-    assert kept.read_text() == "years of work"
+    assert kept.read_text() == "user data"
     assert not (tmp_path / "derived").exists()
 
 
-def test_a_file_of_that_name_is_left_alone(folder):
-    folder.write_text("years of work")
+def test_a_file_with_the_name_of_the_partial_folder_is_not_modified(folder):
+    folder.write_text("user data")
     with pytest.raises(CommandError, match="it is a file"):
         open_partial(folder, DESCRIPTION, resume=True)
-    assert folder.read_text() == "years of work"
+    assert folder.read_text() == "user data"
 
 
-def test_a_complete_target_does_not_remove_what_somebody_keeps_beside_it(folder, tmp_path):
+def test_a_complete_target_does_not_remove_a_foreign_partial_folder(folder, tmp_path):
     meta = tmp_path / "target" / "meta"
     for kept in (meta, folder):
         kept.mkdir(parents=True)
     (meta / "made.json").write_text('{"source": "test/recorded", "size": 76}')
-    (folder / "notes.txt").write_text("years of work")
+    (folder / "notes.txt").write_text("user data")
     assert is_complete(tmp_path / "target", "made.json", DESCRIPTION, True, "--new_root")
     assert (folder / "notes.txt").exists()
 
 
-def test_what_a_command_killed_at_its_beginning_left_is_used(folder):
+def test_the_folder_of_a_command_killed_at_its_start_is_reused(folder):
     folder.mkdir()
     (folder / f"{REQUEST}.0123.part").write_text("{")
     open_partial(folder, DESCRIPTION, resume=False)
     assert (folder / REQUEST).exists()
 
 
-def test_an_interrupted_removal_is_finished_and_not_gone_on_with(folder, monkeypatch):
+def test_an_interrupted_removal_is_completed_and_not_resumed(folder, monkeypatch):
     open_partial(folder, DESCRIPTION, resume=False)
-    (folder / "pieces").mkdir()
-    (folder / "pieces" / "0").write_text("half of it is gone")
+    (folder / "parts").mkdir()
+    (folder / "parts" / "0").write_text("partly removed")
 
     def interrupted(path):
         raise KeyboardInterrupt
@@ -66,12 +66,12 @@ def test_an_interrupted_removal_is_finished_and_not_gone_on_with(folder, monkeyp
         patched.setattr(shutil, "rmtree", interrupted)
         with pytest.raises(KeyboardInterrupt):
             remove_partial(folder)
-    assert {path.name for path in folder.iterdir()} == {DONE, "pieces"}
+    assert {path.name for path in folder.iterdir()} == {DONE, "parts"}
     open_partial(folder, DESCRIPTION, resume=True)
     assert [path.name for path in folder.iterdir()] == [REQUEST]
 
 
-def test_a_run_killed_before_it_cleaned_up_is_complete(recorded, tmp_path, monkeypatch):
+def test_a_run_killed_during_cleanup_is_complete(recorded, tmp_path, monkeypatch):
     target, folder = tmp_path / "derived", tmp_path / "derived.partial"
     with monkeypatch.context() as patched:
         patched.setattr("lerobot_symview.datasets.add_views.remove_partial", lambda folder: None)

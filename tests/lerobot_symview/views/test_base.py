@@ -14,8 +14,8 @@ SIZE = 32
 CENTRE = (0.45, 0.0)
 
 
-def turned(frame, quarter_turns):
-    """The same frame with camera and gripper turned about the workspace centre, which the world turned with."""
+def rotated(frame, quarter_turns):
+    """The frame with camera, gripper and scene rotated about the workspace centre."""
     angle = quarter_turns * np.pi / 2
     rotation = np.eye(4)
     rotation[:2, :2] = np.rint([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -51,16 +51,16 @@ def test_a_view_is_a_pure_function(name):
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
 @pytest.mark.parametrize(("name", "options"), [("reproj", {"infill": "none"}), ("persp", {})])
-def test_turning_camera_and_gripper_turns_the_view(name, options, quarter_turns):
+def test_views_rotate_with_camera_and_gripper(name, options, quarter_turns):
     view = make_view(name, size=SIZE, **options)
     frame = make_frame(gripper=(0.05, -0.08, 0.2, 0.3, 0.8))
-    for output, image in view.render(turned(frame, quarter_turns)).items():
+    for output, image in view.render(rotated(frame, quarter_turns)).items():
         expected = np.rot90(view.render(frame)[output], quarter_turns).astype(float)
         # the warp interpolates in fixed point, so a grey level may differ; a point on a bin's edge may change bins
         assert (np.abs(image.astype(float) - expected) > (3 if name == "persp" else 1e-6)).mean() < 0.01
 
 
-def test_reprojection_from_the_oracles_place_is_the_image_itself():
+def test_reprojection_of_a_top_down_camera_is_its_image():
     size = 40
     camera = make_camera(90.0, size=size, fov=2 * np.rad2deg(np.arctan(0.2 / 0.81)))
     frame = make_frame(camera)
@@ -70,7 +70,7 @@ def test_reprojection_from_the_oracles_place_is_the_image_itself():
     np.testing.assert_allclose(images["reproj_height"], 0.0, atol=1e-6)
 
 
-def test_points_above_the_gripper_never_appear():
+def test_points_above_the_gripper_are_removed():
     frame = make_frame(gripper=(0.0, 0.0, 0.1, 0.0, 1.0))
     free = make_view("reproj", size=SIZE, clip="none").render(frame)["reproj_height"]
     cut = make_view("reproj", size=SIZE).render(frame)["reproj_height"]
@@ -78,13 +78,13 @@ def test_points_above_the_gripper_never_appear():
     assert cut.max() <= 0.09 + 1e-6
 
 
-def test_what_the_gripper_touches_stays_visible():
+def test_points_below_the_clip_floor_are_kept():
     frame = make_frame(gripper=(0.0, 0.0, 0.02, 0.0, 1.0))
     assert 0.03 < make_view("reproj", size=SIZE).render(frame)["reproj_height"].max() <= 0.06 + 1e-6
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
-def test_invalid_depth_never_writes(bad):
+def test_invalid_depth_gives_an_empty_view(bad):
     frame = make_frame()
     depth = np.full_like(frame.depth, bad)
     images = make_view("reproj", size=SIZE).render(
@@ -107,18 +107,18 @@ def test_invalid_depth_never_writes(bad):
         ({"gripper": np.array([0.0, 0.0, 0.2, 0.0, np.inf])}, "gripper.*must be finite, got .*inf"),
     ],
 )
-def test_what_no_camera_or_encoder_measures_is_refused(wrong, message):
+def test_frames_with_wrong_shapes_dtypes_or_gripper_states_are_rejected(wrong, message):
     with pytest.raises(ValueError, match=message):
         replace(make_frame(), **wrong)
 
 
-def test_reprojection_without_depth_names_the_alternative():
+def test_reprojection_without_depth_suggests_persp():
     frame = make_frame()
     with pytest.raises(ValueError, match="persp"):
         make_view("reproj").render(Frame(frame.rgb, None, frame.camera, frame.workspace, frame.gripper))
 
 
-def test_an_unknown_view_is_answered_with_the_nearest_known_one():
+def test_an_unknown_view_error_suggests_the_closest_name():
     with pytest.raises(ValueError, match="did you mean 'reproj'"):
         make_view("reprojj")
 
@@ -144,13 +144,13 @@ def test_an_unknown_view_is_answered_with_the_nearest_known_one():
         ("persp", {"plane_height": np.inf}),
     ],
 )
-def test_impossible_options_are_refused(name, options):
+def test_invalid_options_are_rejected(name, options):
     with pytest.raises(ValueError, match=next(iter(options))):
         make_view(name, **options)
 
 
 @pytest.mark.parametrize("name", list(VIEWS))
-def test_every_combination_of_outputs_is_what_is_declared(name):
+def test_rendered_outputs_are_the_declared_outputs(name):
     switches = [field.name for field in fields(VIEWS[name]) if isinstance(field.default, bool)]
     for values in product([False, True], repeat=len(switches)):
         view = make_view(name, size=SIZE, **dict(zip(switches, values, strict=True)))
@@ -158,7 +158,7 @@ def test_every_combination_of_outputs_is_what_is_declared(name):
 
 
 @pytest.mark.parametrize("name", list(VIEWS))
-def test_without_the_grippers_state_nothing_is_clipped_and_no_gripper_drawn(name):
+def test_without_gripper_state_views_are_unclipped_and_have_no_gripper_image(name):
     view = make_view(name, size=SIZE)
     assert view.uses_gripper
     without = view.without_gripper()
@@ -172,7 +172,7 @@ def test_without_the_grippers_state_nothing_is_clipped_and_no_gripper_drawn(name
             np.testing.assert_array_equal(image, expected[output])
 
 
-def test_a_plane_that_follows_the_gripper_needs_its_state():
+def test_a_plane_that_follows_the_gripper_requires_its_state():
     view = make_view("persp", size=SIZE, plane_height="gripper")
     with pytest.raises(ValueError, match="plane_height=gripper needs the gripper's state"):
         view.render(replace(make_frame(), gripper=None))
@@ -181,7 +181,7 @@ def test_a_plane_that_follows_the_gripper_needs_its_state():
 
 
 @pytest.mark.parametrize("gripper", [None, (0.05, -0.08, 0.2, 0.3, 0.8)])
-def test_the_functions_render_what_the_views_do(gripper):
+def test_reproject_and_warp_table_equal_the_views(gripper):
     frame = replace(make_frame(), gripper=None if gripper is None else np.array(gripper))
     top = reproject(frame.rgb, frame.depth, frame.camera, frame.workspace, frame.gripper, size=SIZE)
     images = make_view("reproj", size=SIZE, mask=True).render(frame)
@@ -203,7 +203,7 @@ def test_integer_depth_is_millimetres():
     np.testing.assert_array_equal(views[0].height, views[1].height)
 
 
-def test_an_unknown_option_names_the_known():
+def test_an_unknown_option_error_lists_the_known_options():
     frame = make_frame()
     with pytest.raises(ValueError, match="the view 'reproj' has no option infil; it has size, infill"):
         reproject(frame.rgb, frame.depth, frame.camera, frame.workspace, infil="none")
@@ -223,35 +223,38 @@ def test_a_view_is_specified_by_name_or_mapping(entry, expected):
 
 
 @pytest.mark.parametrize("entry", [3, None, {}, {"plane_height": 0.025}, {"name": 3}])
-def test_what_specifies_no_view_is_refused(entry):
-    with pytest.raises(ValueError, match="a view is a name or a mapping with a name and options"):
+def test_invalid_view_specifications_are_rejected(entry):
+    with pytest.raises(ValueError, match="a view must be a name or a mapping with a name and options"):
         ViewSpec.parse(entry)
 
 
 @pytest.mark.parametrize(
     ("specs", "message"),
-    [([], "name at least one view"), ([ViewSpec("persp"), ViewSpec("persp")], "the view 'persp' is named twice")],
+    [
+        ([], "expected at least one view, got none"),
+        ([ViewSpec("persp"), ViewSpec("persp")], "the view 'persp' is given twice"),
+    ],
 )
-def test_lists_of_views_name_each_once(specs, message):
+def test_empty_lists_and_repeated_views_are_rejected(specs, message):
     with pytest.raises(ValueError, match=message):
         make_views(specs)
 
 
-def test_a_fixed_height_cuts_wherever_the_gripper_is():
+def test_a_fixed_clip_height_ignores_the_gripper():
     for gripper_height in (0.02, 0.2):
         frame = make_frame(gripper=(0.0, 0.0, gripper_height, 0.0, 1.0))
         heights = make_view("reproj", size=SIZE, clip=0.03).render(frame)["reproj_height"]
         assert 0.02 < heights.max() <= 0.03 + 1e-6
 
 
-def test_an_infinite_height_cuts_nothing():
+def test_an_infinite_clip_height_removes_no_point():
     frame = make_frame()
     expected = make_view("reproj", size=SIZE, clip="none").render(frame)
     for output, image in make_view("reproj", size=SIZE, clip=np.inf).render(frame).items():
         np.testing.assert_array_equal(image, expected[output])
 
 
-def test_the_plane_follows_the_gripper_if_asked():
+def test_the_plane_follows_the_gripper_with_plane_height_gripper():
     frame = make_frame(gripper=(0.0, 0.0, 0.07, 0.0, 1.0))
     following = make_view("persp", size=SIZE, plane_height="gripper").render(frame)["persp"]
     np.testing.assert_array_equal(
@@ -261,12 +264,12 @@ def test_the_plane_follows_the_gripper_if_asked():
 
 
 def table_frame(camera, dtype=np.float32):
-    """The bare table, each pixel of another colour."""
+    """The empty table, with a random colour at each pixel."""
     rgb = np.random.default_rng(0).integers(1, 256, (camera.height, camera.width, 3), dtype=np.uint8)
     return Frame(rgb, plane_depth(camera).astype(dtype), camera, Workspace(), np.array([0.0, 0.0, 0.3, 0.0, 1.0]))
 
 
-def test_a_larger_source_leaves_no_gaps_in_a_surface():
+def test_upsampling_the_source_closes_gaps_in_surfaces():
     frame = table_frame(make_camera(45.0))
     shares = [
         (make_view("reproj", source_scale=scale, mask=True).render(frame)["reproj_seen"] > 0).mean()
@@ -278,7 +281,7 @@ def test_a_larger_source_leaves_no_gaps_in_a_surface():
 
 
 @pytest.mark.parametrize("scale", [1, 3])
-def test_the_mask_tells_seen_from_inferred(scale):
+def test_the_mask_separates_measured_from_infilled_pixels(scale):
     frame = make_frame()
     options = {"size": SIZE, "source_scale": scale, "mask": True}
     bare = make_view("reproj", infill="none", **options).render(frame)
@@ -291,12 +294,12 @@ def test_the_mask_tells_seen_from_inferred(scale):
 
 
 @pytest.mark.parametrize("infill", INFILLS)
-def test_a_frame_without_any_point_gives_black(infill):
+def test_a_frame_without_valid_depth_gives_black_images(infill):
     frame = replace(make_frame(), depth=np.zeros((96, 96), np.float32))
     images = make_view("reproj", size=SIZE, infill=infill, mask=True).render(frame)
     assert not any(image.any() for image in images.values())
 
 
-def test_a_name_is_registered_once():
+def test_a_name_cannot_be_registered_twice():
     with pytest.raises(ValueError, match="already"):
         register_view("reproj")(object)

@@ -1,4 +1,4 @@
-"""The same bits as the compiled kernels; on a GPU too, where there is one."""
+"""Batched views are bit-identical to the compiled kernels, on the CPU and, if there is one, on a GPU."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ OPTIONS = [
 
 
 def frames_of(views, seed):
-    """Two frames; heights come in steps, so that many are equal."""
+    """One frame per camera; every second row of depth is rounded, so that many heights are equal."""
     rng = np.random.default_rng(seed)
     for camera in views:
         depth = random_depth(int(rng.integers(2**31))).astype(np.float32)
@@ -47,24 +47,24 @@ def batch_of(frames, device):
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("name", "options"), OPTIONS)
 @given(views=st.lists(cameras(), min_size=2, max_size=2), seed=st.integers(0, 2**32 - 1))
-def test_a_batch_has_the_bits_of_its_frames(name, options, device, views, seed):
+def test_batches_are_bit_identical_to_single_frames(name, options, device, views, seed):
     view, frames = make_view(name, size=SIZE, **options), list(frames_of(views, seed))
     try:
         expected = [view.render(frame) for frame in frames]
-    except ValueError:  # the camera lies behind or in the plane: the same is said of the batch
+    except ValueError:  # the plane is behind the camera or edge-on: the batch raises the same error
         with pytest.raises(ValueError, match=r"workspace|plane"):
             render_batch(view, batch_of(frames, device))
         return
     images = render_batch(view, batch_of(frames, device))
     assert list(images) == list(view.outputs)
     for output, stacked in images.items():
-        for one, image in zip(expected, stacked.cpu().numpy(), strict=True):
-            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, one[output])
+        for single, image in zip(expected, stacked.cpu().numpy(), strict=True):
+            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, single[output])
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @given(known=MASKS.filter(np.any))
-def test_nearest_pixels_are_those_found_one_by_one(device, known):
+def test_batched_nearest_pixels_equal_the_compiled_kernel(device, known):
     batch = torch.from_numpy(np.stack([known, np.zeros_like(known)])).to(device)
     found = nearest_known_batch(batch).cpu().numpy()
     np.testing.assert_array_equal(found[0], nearest_known(known))
@@ -78,7 +78,7 @@ def colored_batch(**changes):
 
 
 @pytest.mark.parametrize("options", [{"infill": "local"}, {"source_scale": 2}])
-def test_what_is_not_batched_says_so(options):
+def test_views_that_cannot_be_batched_raise_an_error(options):
     view = make_view("reproj", **options)
     assert not can_batch(view)
     batch = colored_batch()
@@ -86,7 +86,7 @@ def test_what_is_not_batched_says_so(options):
         render_batch(view, batch)
 
 
-def test_missing_inputs_are_named():
+def test_missing_depth_or_gripper_state_raises_an_error():
     batch = colored_batch()
     with pytest.raises(ValueError, match="needs depth"):
         render_batch(make_view("reproj"), batch)
@@ -94,7 +94,7 @@ def test_missing_inputs_are_named():
         render_batch(make_view("persp", plane_height="gripper"), batch)
 
 
-def test_without_the_grippers_state_no_gripper_is_drawn():
+def test_without_gripper_state_there_is_no_gripper_image():
     batch = colored_batch()
     images = render_batch(make_view("persp"), batch)
     assert list(images) == ["persp"]
@@ -107,19 +107,19 @@ def test_without_the_grippers_state_no_gripper_is_drawn():
         ({"rgb": torch.zeros(2, 8, 8, 3, dtype=torch.uint8)}, r"rgb must be \(B, 3, H, W\) uint8, got \(2, 8, 8, 3\)"),
         ({"rgb": torch.zeros(2, 3, 8, 8)}, "rgb must be .*uint8.*float32"),
         ({"rgb": torch.zeros(2, 3, 6, 8, dtype=torch.uint8)}, r"rgb has 6 x 8 pixels, the cameras have \[\(8, 8\)\]"),
-        ({"cameras": [make_camera(size=8)]}, "2 frames need as many cameras, got 1"),
+        ({"cameras": [make_camera(size=8)]}, "2 frames need 2 cameras, got 1"),
         ({"cameras": [make_camera(size=8), make_camera(size=6)]}, r"8 x 8 pixels, .*\(6, 6\)"),
         ({"depth": torch.zeros(2, 1, 8, 8)}, r"depth must be \(2, 8, 8\) .*got \(2, 1, 8, 8\)"),
         ({"depth": torch.zeros(2, 8, 8, dtype=torch.int32)}, "depth must be .*float metres.*int32"),
     ],
 )
-def test_images_that_are_not_the_cameras_are_refused(changes, message):
+def test_batches_with_wrong_shapes_or_dtypes_are_rejected(changes, message):
     with pytest.raises(ValueError, match=message):
         colored_batch(**changes)
 
 
 @pytest.mark.parametrize("options", [{}, {"plane_height": "gripper"}])
-def test_a_gripper_that_is_nowhere_is_refused(options):
+def test_a_non_finite_gripper_state_is_rejected(options):
     gripper = torch.tensor([[0.0, 0.0, 0.2, 0.0, 1.0], [0.0, 0.0, torch.nan, 0.0, 1.0]])
     with pytest.raises(ValueError, match=r"gripper.*must be finite, got .*nan"):
         render_batch(make_view("persp", **options), colored_batch(gripper=gripper))
