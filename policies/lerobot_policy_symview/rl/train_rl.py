@@ -15,7 +15,7 @@ from lerobot_policy_symview.rl.learner import METRICS
 from lerobot_policy_symview.rl.metrics import MetricsLogger, MetricsWindow
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.training import Training
-from lerobot_symview.runtime.cli import run_command
+from lerobot_symview.runtime.cli import flagged, run_command
 
 logger = logging.getLogger(__name__)
 
@@ -36,7 +36,9 @@ def train_rl(config: TrainRlConfig) -> Path:
     """
     last = last_checkpoint(config)
     description = describe(config)
-    with Training(config, open_dataset(config.dataset)) as training, _interruptions() as interruptions:
+    with flagged("--dataset"):
+        dataset = open_dataset(config.dataset)
+    with Training(config, dataset) as training, _interruptions() as interruptions:
         run_id = config.wandb.run_id
         if last:
             run_id = restore(training, last) or run_id

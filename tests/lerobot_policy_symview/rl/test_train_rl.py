@@ -259,7 +259,7 @@ def test_an_output_folder_with_a_different_run_is_refused(recorded, whole, optio
 def test_a_missing_checkpoint_and_a_missing_dataset_are_reported(recorded, tmp_path):
     with pytest.raises(SymviewError, match=r"no checkpoint in .* to resume from: leave out --resume=true"):
         train_rl(make_config(recorded, tmp_path / "empty", resume=True))
-    with pytest.raises(SymviewError, match=r"there is no dataset in .*--dataset.root"):
+    with pytest.raises(SymviewError, match=r"--dataset: there is no LeRobot dataset in"):
         train_rl(make_config(tmp_path / "nowhere", tmp_path / "empty"))
 
 
@@ -305,4 +305,4 @@ def test_the_command_reports_an_error_in_one_line(monkeypatch, capsys, tmp_path)
     with pytest.raises(SystemExit) as end:
         command.main()
     assert end.value.code == 1
-    assert capsys.readouterr().err.startswith(f"symview-train-rl: error: there is no dataset in {tmp_path}")
+    assert capsys.readouterr().err.startswith(f"symview-train-rl: error: --dataset: there is no LeRobot dataset in {tmp_path}")
