@@ -64,8 +64,9 @@ def test_site_has_every_page_and_public_name(site):
     reference = (site / "reference.html").read_text()
     for name in (
         "views.make_view",
-        "camera.project",
-        "zbuffer.zbuffer_from_points",
+        "geometry.camera.project",
+        "geometry.zbuffer.zbuffer_from_points",
+        "views.reproject",
         "views.ReprojectedView.infill",
     ):
         assert f'id="lerobot_symview.{name}"' in reference, name
