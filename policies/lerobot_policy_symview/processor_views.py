@@ -58,6 +58,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
     depth_units: dict[str, Unit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.views, list | tuple):
+            raise ValueError(f"views must be a list of names or mappings, got {self.views!r}")
         specs = [ViewSpec.parse(view) for view in self.views]
         self.views = [spec.plain() for spec in specs]
         views = make_views(specs) if specs else {}

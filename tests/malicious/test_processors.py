@@ -92,8 +92,15 @@ def test_the_state_file_of_a_step_must_be_inside_the_policy(checkpoint, tmp_path
 
 
 def test_a_processor_file_cannot_request_huge_views(checkpoint):
-    add_step(checkpoint, {"registry_name": "symview_views", "config": {"views": {"persp": {"size": 10**6}}}})
+    add_step(checkpoint, {"registry_name": "symview_views", "config": {"views": [{"name": "persp", "size": 10**6}]}})
     with pytest.raises(ValueError, match="size must"):
+        load_with_processors(checkpoint)
+
+
+@pytest.mark.parametrize("views", [{"persp": {"size": 76}}, "persp", 3])
+def test_views_that_are_no_list_are_refused(checkpoint, views):
+    add_step(checkpoint, {"registry_name": "symview_views", "config": {"views": views}})
+    with pytest.raises(ValueError, match="views must be a list of names or mappings"):
         load_with_processors(checkpoint)
 
 

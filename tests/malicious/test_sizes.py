@@ -89,7 +89,7 @@ def test_distant_video_frames_are_refused(dataset, tmp_path):
 
 
 def test_symmetry_declarations_have_a_maximum_length():
-    with pytest.raises(ValueError, match=r"--policy\.state_symmetry has 100000 entries"):
+    with pytest.raises(ValueError, match=r"--policy\.state_symmetry has 100000 dimensions"):
         SymviewBcConfig(device="cpu", gripper_input="vector", state_symmetry=["scalar"] * 10**5)
 
 
