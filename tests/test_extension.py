@@ -15,6 +15,8 @@ from symview_sim.settings import NewDataset
 from tests.helpers.packages import install
 from tests.helpers.training import train
 
+pytestmark = pytest.mark.long
+
 MODULE = """
     from dataclasses import dataclass
 

@@ -15,6 +15,8 @@ from playwright.sync_api import sync_playwright
 
 from tests.docs.pages import PAGES, ROOT
 
+pytestmark = pytest.mark.long
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 QUIET = [
     "--no-sandbox",

@@ -27,6 +27,8 @@ from tests.helpers.training import train
 from tests.hub.client import online
 from tests.hub.server import ALICE, BOB, HubServer
 
+pytestmark = pytest.mark.long
+
 STOCK = {  # the smallest networks
     "act": ["--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32"]
     + ["--policy.pretrained_backbone_weights=null"],

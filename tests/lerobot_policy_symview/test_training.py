@@ -10,6 +10,8 @@ from lerobot_symview import keys
 from symview_sim.settings import EnvSettings
 from tests.helpers.training import train
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_trains_saves_loads_and_acts(method, with_views, tmp_path, monkeypatch, capsys):

@@ -23,6 +23,8 @@ from tests.conftest import VIEW_SIZE
 from tests.helpers.datasets import contents, views_config
 from tests.helpers.files import largest_file
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def small_parts(monkeypatch):

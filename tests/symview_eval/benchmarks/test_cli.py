@@ -10,6 +10,8 @@ from symview_eval.benchmarks import policy as policy_benchmark
 from symview_eval.benchmarks import rl as rl_benchmark
 from symview_eval.benchmarks import views as views_benchmark
 
+pytestmark = pytest.mark.long
+
 
 def test_the_experts_benchmark_reports_every_task():
     results = experts.benchmark_experts(experts.ExpertsBenchmark(seeds=2, tasks=["block_picking"]))
