@@ -154,6 +154,7 @@ def test_public_names_exist_and_simulators_import_without_numba():
     assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0
 
 
+@pytest.mark.long
 def test_plugin_import_skips_network_view_and_simulator_modules():
     slow = "{'numba', 'escnn', 'pybullet', 'symview_sim.env', 'lerobot_policy_symview.modeling_symview_bc'}"
     check = f"import sys, lerobot_policy_symview; sys.exit(', '.join({slow} & set(sys.modules)) or 0)"

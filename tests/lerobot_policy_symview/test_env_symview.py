@@ -68,6 +68,7 @@ def test_all_tasks_or_a_list_form_a_suite():
         SymviewEnvConfig(task="block_picking, drawer_open").create_envs(1)
 
 
+@pytest.mark.long
 def test_asynchronous_environments_match_synchronous_ones_and_freeze_when_done():
     config = SymviewEnvConfig(camera=SMALL)
     asynchronous = config.create_envs(2, use_async_envs=True)["block_picking"][0]

@@ -121,6 +121,7 @@ def test_invalid_flags_raise_an_error_and_write_nothing(recorded, tmp_path, opti
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_videos_are_copied_and_give_the_views_of_their_images(tmp_path):
     """Lossless colour videos give identical views; quantised depth changes few points."""
     env = RecordedEnv(camera=CameraSpec(height=64, width=64), oracle=False)
@@ -179,6 +180,7 @@ def test_a_source_inside_the_partial_folder_is_rejected(recorded, tmp_path):
         add_views(views_config(source, tmp_path / "views"))
 
 
+@pytest.mark.long
 def test_lerobots_act_policy_trains_on_views_for_stock_policies(recorded, tmp_path, monkeypatch):
     source = views_config(recorded, tmp_path / "stock", for_stock_policies=True)
     dataset = LeRobotDataset("test/stock", root=add_views(source))

@@ -40,6 +40,7 @@ from tests.helpers.datasets import images_of, views_config
 NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 
 
+@pytest.mark.long
 def test_calibration_from_a_file_gives_the_same_views(recorded, with_views, tmp_path):
     """A dataset without calibration gets the same views with a calibration file; the result stores the calibration."""
     source = LeRobotDataset("test/recorded", root=recorded)
@@ -245,6 +246,7 @@ def test_a_recorded_camera_that_misses_the_workspace_logs_a_warning(recorded, tm
     assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty outside its image", caplog.text)
 
 
+@pytest.mark.long
 def test_the_workspace_flag_overrides_the_file_and_the_dataset(recorded, tmp_path):
     bare, file = tmp_path / "bare", tmp_path / "cameras.json"
     source = LeRobotDataset("test/recorded", root=recorded)
