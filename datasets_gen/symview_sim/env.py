@@ -15,7 +15,7 @@ from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
 from symview_sim.depth_sensor import degrade
 from symview_sim.motions import MAX_STEP, MAX_YAW_STEP
-from symview_sim.rendering import Picture, render
+from symview_sim.rendering import CameraImages, render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
@@ -144,7 +144,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
             observation[_env_key(keys.world_from_cam(name))] = camera.world_from_cam.ravel().astype(np.float32)
         return observation
 
-    def _render(self, spec: CameraSpec) -> Picture:
+    def _render(self, spec: CameraSpec) -> CameraImages:
         camera = self.cameras[spec.name]
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
             image = render(self.scene.client, camera, labelled=self.settings.segmentation)

@@ -18,7 +18,7 @@ TILE_COLORS = np.array([[206, 200, 190], [188, 182, 172]], dtype=np.uint8)
 SKY = np.array([235, 240, 245], dtype=np.uint8)
 
 
-class Picture(NamedTuple):
+class CameraImages(NamedTuple):
     """What one camera sees.
 
     Args:
@@ -33,7 +33,7 @@ class Picture(NamedTuple):
     labels: NDArray[np.uint8] | None
 
 
-def render(client: Any, camera: Camera, labelled: bool = False) -> Picture:
+def render(client: Any, camera: Camera, labelled: bool = False) -> CameraImages:
     """Render a scene that stands on the table z = 0.
 
     Bodies are drawn by PyBullet's software renderer; the table is computed per pixel, which is exact and costs a third
@@ -69,11 +69,11 @@ def render(client: Any, camera: Camera, labelled: bool = False) -> Picture:
     rgb.reshape(-1, 3)[drawn] = rgba.reshape(-1, 4)[drawn, :3]
     depth.ravel()[drawn] = drawn_depth
     if not labelled:
-        return Picture(rgb, depth, None)
+        return CameraImages(rgb, depth, None)
     labels = np.zeros(depth.shape, dtype=np.uint8)
     loaded = [client.getBodyUniqueId(index) for index in range(client.getNumBodies())]
     labels.ravel()[drawn] = np.searchsorted(loaded, mask.ravel()[drawn])
-    return Picture(rgb, depth, labels)
+    return CameraImages(rgb, depth, labels)
 
 
 @lru_cache(maxsize=64)  # a camera mostly stays where it is

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, is_depth_feature
 
-CARD, IMAGE = "README.md", "meta/symview_picture.png"
+CARD, IMAGE = "README.md", "meta/symview_image.png"
 SHOWN_FRAME = 2  # index in the first episode: the arm is in the image and the gripper moves
 HEIGHT = 228  # rows of the card's image
 TAGS = ("LeRobot", "symview", "robotics", "equivariance")

@@ -89,9 +89,9 @@ class Derivation:
 
     def table_file(self, source: SourceDataset, part: int) -> Path:
         """Return the file of a part's table in the result."""
-        return self.dataset / source.data_path(*self.place(source, part))
+        return self.dataset / source.data_path(*self.file_index(source, part))
 
-    def place(self, source: SourceDataset, part: int) -> tuple[int, int]:
+    def file_index(self, source: SourceDataset, part: int) -> tuple[int, int]:
         """Return the chunk index and file index of a part's table."""
         return divmod(part, source.info["chunks_size"])
 
@@ -110,7 +110,7 @@ def cut_parts(source: SourceDataset) -> list[range]:
     parts: list[range] = []
     frames = 0
     for episode, row in enumerate(source.episodes):
-        if parts and frames < PART_FRAMES and source.data_place(episode) == source.data_place(parts[-1].start):
+        if parts and frames < PART_FRAMES and source.file_index(episode) == source.file_index(parts[-1].start):
             parts[-1] = range(parts[-1].start, episode + 1)
             frames += row["length"]
         else:
@@ -275,13 +275,13 @@ def _rewrite_episodes(
     """Update the table locations of a file of episode metadata, and its statistics."""
     table = pq.read_table(file).replace_schema_metadata(None)
     dropped = tuple(
-        f"{place}/{key}/" for place in ("stats", "videos") for key in (*derivation.dropped, *derivation.added)
+        f"{prefix}/{key}/" for prefix in ("stats", "videos") for key in (*derivation.dropped, *derivation.added)
     )
     table = table.drop_columns([name for name in table.column_names if name.startswith(dropped)])
     episodes = table["episode_index"].to_pylist()
     part_of_episode = {episode: part for part, range_ in enumerate(parts) for episode in range_}
-    places = np.array([derivation.place(source, part_of_episode[episode]) for episode in episodes])
-    for column, values in (("data/chunk_index", places[:, 0]), ("data/file_index", places[:, 1])):
+    file_indices = np.array([derivation.file_index(source, part_of_episode[episode]) for episode in episodes])
+    for column, values in (("data/chunk_index", file_indices[:, 0]), ("data/file_index", file_indices[:, 1])):
         table = table.set_column(table.column_names.index(column), column, pa.array(values))
     for key, named in statistics.items():
         for name, of_episodes in named.items():

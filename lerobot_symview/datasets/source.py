@@ -99,9 +99,9 @@ class SourceDataset:
 
     def data_file(self, episode: int) -> Path:
         """Return the file of an episode's table."""
-        return self.folder / self.data_path(*self.data_place(episode))
+        return self.folder / self.data_path(*self.file_index(episode))
 
-    def data_place(self, episode: int) -> tuple[int, int]:
+    def file_index(self, episode: int) -> tuple[int, int]:
         """Return the chunk index and file index of an episode's table."""
         row = self.episodes[episode]
         return row["data/chunk_index"], row["data/file_index"]
@@ -112,13 +112,13 @@ class SourceDataset:
 
     def first_row(self, episode: int) -> int:
         """Return the index of an episode's first row in its table file."""
-        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.data_place(episode)]
+        return self.episodes[episode]["dataset_from_index"] - self._file_starts[self.file_index(episode)]
 
     @cached_property
     def _file_starts(self) -> dict[tuple[int, int], int]:
         starts: dict[tuple[int, int], int] = {}
         for episode, row in enumerate(self.episodes):
-            starts.setdefault(self.data_place(episode), row["dataset_from_index"])
+            starts.setdefault(self.file_index(episode), row["dataset_from_index"])
         return starts
 
     def video_file(self, key: str, episode: int) -> Path:

@@ -67,7 +67,7 @@ def test_a_generated_dataset_is_pushed_and_loaded(hub, tmp_path):
     assert {"LeRobot", "symview", "mine"} <= set(card.data.tags)
     for fact in ("block_picking", "panda", "`observation.images.side`", "45 degrees", "100.0 %", "K in pixels"):
         assert fact in card.text
-    assert hub.files("alice/new")["meta/symview_picture.png"].startswith(b"\x89PNG")
+    assert hub.files("alice/new")["meta/symview_image.png"].startswith(b"\x89PNG")
 
 
 def test_views_are_pushed_to_a_private_branch_with_their_parameters(hub, target, tmp_path):

@@ -209,12 +209,12 @@ def test_a_recording_killed_at_any_time_resumes_and_writes_the_same_data(tmp_pat
     command = [COMMAND, f"--root={root}", "--num_episodes=6", "--num_workers=2", "--resume=true"]
     command += ["--env.oracle=false", "--env.camera.height=32", "--env.camera.width=32", "--dataset.repo_id=test/small"]
     dice = random.Random(0)
-    moments = [lambda n=n: len(list(partial.glob("episodes/*.npz"))) >= n for n in (1, 4)]
-    moments.append(lambda: any(partial.glob("shards/*.part/*")))
+    milestones = [lambda n=n: len(list(partial.glob("episodes/*.npz"))) >= n for n in (1, 4)]
+    milestones.append(lambda: any(partial.glob("shards/*.part/*")))
     kept = 0
-    for moment in moments:
+    for reached in milestones:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        while not moment():
+        while not reached():
             assert process.poll() is None
             time.sleep(0.02)
         time.sleep(0.2 * dice.random())
