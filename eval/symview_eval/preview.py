@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.datasets.add_views import calibration_and_workspace, views_for_dataset
+from lerobot_symview.datasets.add_views import calibration_and_workspace, unit_from_flag, views_for_dataset
+from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
 from lerobot_symview.geometry.camera import Camera, project
-from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace
+from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE
+from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
@@ -62,6 +64,9 @@ class PreviewConfig:
     """Options of the view persp."""
     calibration: Path | None = None
     """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
+    depth_unit: str | None = None
+    """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
+    default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
     workspace: Workspace | None = None
     """Square of the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
     default that of the calibration file, else the dataset's, else the simulator's. The gripper's x and y are relative
@@ -81,6 +86,7 @@ class PreviewConfig:
             raise ValueError("--episodes is empty: give at least one, such as --episodes='[0]'")
         if not 0 <= self.max_holes <= 1:
             raise ValueError(f"--max_holes must lie in [0, 1], got {self.max_holes}")
+        unit_from_flag(self.depth_unit)
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,8 @@ def preview(config: PreviewConfig) -> Path:
     Raises:
         CommandError: if the dataset has no such episode.
         ValueError: if it has no such camera.
+        CalibrationError: if the images contradict the calibration; the contact sheet is written nevertheless, unless
+            the camera is below the table.
     """
     with flagged("--dataset"):
         source = SourceDataset(config.dataset.folder())
@@ -168,6 +176,9 @@ def preview(config: PreviewConfig) -> Path:
     montage(rows).save(config.output_dir / "preview.png")
     (config.output_dir / "preview.html").write_text(page(config.dataset.repo_id, rows, warnings))
     logger.info("wrote %s", ", ".join(str(file) for file in sorted(config.output_dir.glob("preview.*"))))
+    if reader is not None:
+        with flagged(f"--camera={config.camera}, --calibration, --depth_unit"):
+            check_calibration(reader)
     return config.output_dir
 
 
@@ -190,6 +201,7 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
     reader = FrameReader(source, config.camera, workspace, read_for, calibration)
     with flagged(f"--camera={config.camera}, --calibration"):
         reader.check()
+        reader = with_depth_unit(reader, unit_from_flag(config.depth_unit))
     return reader, views
 
 

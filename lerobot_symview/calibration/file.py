@@ -1,7 +1,8 @@
 """Camera calibration from a file, for datasets and robots that do not store it.
 
 Matrices are rounded to float32, the precision of datasets, so that views rendered with the file's matrices and with a
-dataset's stored matrices are bit-identical.
+dataset's stored matrices are bit-identical. In place of `world_from_cam` the file may have its inverse,
+`cam_from_world`, or `position` and `quaternion_xyzw` of the camera in the world.
 
 The file is YAML or JSON:
 
@@ -13,37 +14,49 @@ The file is YAML or JSON:
       front:                        # as in observation.images.front
         height: 480
         width: 640
-        intrinsics: [[615.3, 0, 319.5], [0, 615.1, 239.5], [0, 0, 1]]
+        intrinsics: [615.3, 615.1, 319.5, 239.5]      # fx, fy, cx, cy; or the 3 x 3 matrix K
         world_from_cam:             # OpenCV axes; the world's z axis points up and its table is z = 0
           - [0,  0.70711, -0.70711, 1.02]
           - [1,  0,        0,       0   ]
           - [0, -0.70711, -0.70711, 0.57]
-          - [0,  0,        0,       1   ]
+        depth_unit: mm              # m, mm, or metres per unit such as 0.0001; optional
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, Camera
+from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
+from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
 
+logger = logging.getLogger(__name__)
+
 METRES = {"m": 1.0, "mm": 0.001}
-CAMERA_ENTRIES = ("height", "width", "intrinsics", "world_from_cam")
+REQUIRED = ("height", "width", "intrinsics")
+POSES = ("world_from_cam", "cam_from_world", "position")
+OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion")
+ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
+UNDISTORT = (
+    "lens distortion is not supported: undistort the images when recording, "
+    "cv2.undistort(image, K, distortion, None, new_K), and give new_K as intrinsics"
+)
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Fixed cameras by name, and the workspace if the file declares one."""
+    """Fixed cameras by name; the workspace, and the depth units in metres per unit, that the file declares."""
 
     cameras: dict[str, Camera]
     workspace: Workspace | None = None
+    depth_units: dict[str, float] = field(default_factory=dict)
 
     def camera(self, name: str) -> Camera:
         """Return the camera `name`.
@@ -95,11 +108,13 @@ def parse_calibration(content: Any) -> Calibration:
         problems.append("cameras must be a mapping with at least one camera")
         named = {}
     metres = METRES.get(str(units), 1.0)
-    cameras, workspace = {}, None
+    cameras, depth_units, workspace = {}, {}, None
     for name, entries in named.items():
         try:
-            cameras[str(name)] = _camera(entries, metres)
-        except CalibrationError as error:
+            cameras[str(name)] = _camera(str(name), entries, metres)
+            if entries.get("depth_unit") is not None:
+                depth_units[str(name)] = parse_unit(entries["depth_unit"])
+        except ValueError as error:
             problems.append(f"camera {name!r}: {error}")
     if content.get("workspace") is not None:
         try:
@@ -108,7 +123,7 @@ def parse_calibration(content: Any) -> Calibration:
             problems.append(f"workspace: {error}")
     if problems:
         raise CalibrationError("; ".join(problems))
-    return Calibration(cameras, workspace)
+    return Calibration(cameras, workspace, depth_units)
 
 
 def parse_workspace(entries: Any) -> Workspace:
@@ -138,6 +153,7 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
             "width": camera.width,
             "intrinsics": camera.intrinsics.tolist(),
             "world_from_cam": camera.world_from_cam.tolist(),
+            **({"depth_unit": calibration.depth_units[name]} if name in calibration.depth_units else {}),
         }
         for name, camera in calibration.cameras.items()
     }
@@ -147,28 +163,88 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
     return content
 
 
-def _camera(entries: Any, metres: float) -> Camera:
+def _camera(name: str, entries: Any, metres: float) -> Camera:
     if not isinstance(entries, Mapping):
-        raise CalibrationError(f"expected a mapping with {', '.join(CAMERA_ENTRIES)}, got {entries!r}")
-    missing = [entry for entry in CAMERA_ENTRIES if entry not in entries]
-    problems = _unknown_keys("it", entries, CAMERA_ENTRIES)
+        raise CalibrationError(f"expected a mapping with {', '.join(REQUIRED)} and a pose, got {entries!r}")
+    problems = _unknown_keys("it", entries, (*REQUIRED, *POSES, *OPTIONAL))
+    missing = [entry for entry in REQUIRED if entry not in entries]
     if missing:
         problems.append(f"lacks {', '.join(missing)}")
+    if sum(pose in entries for pose in POSES) != 1:
+        problems.append(f"expected one of {', '.join(POSES)}, got {', '.join(set(POSES) & set(entries)) or 'none'}")
+    if ("position" in entries) != ("quaternion_xyzw" in entries):
+        problems.append("position and quaternion_xyzw belong together")
+    if np.any(entries.get("distortion") or 0):
+        problems.append(UNDISTORT)
     if problems:
         raise CalibrationError("; ".join(problems))
     for side in ("height", "width"):
         if not isinstance(entries[side], int) or entries[side] < 1:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
-    intrinsics, world_from_cam = _matrix("intrinsics", entries, 3), _matrix("world_from_cam", entries, 4)
-    world_from_cam[:3, 3] *= metres
+    intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
     return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
 
 
-def _matrix(name: str, entries: Mapping[str, Any], side: int) -> Array:
+def _intrinsics(value: Any) -> Array:
+    """Return K (3, 3) from a matrix, from fx, fy, cx, cy, or from a mapping with these names."""
+    if isinstance(value, Mapping):
+        value = [value.get(name) for name in ("fx", "fy", "cx", "cy")]
+    numbers = _numbers("intrinsics", value, (4, 9), "fx, fy, cx, cy or 3 rows of 3 numbers")
+    if len(numbers) == 9:
+        return numbers.reshape(3, 3)
+    fx, fy, cx, cy = numbers
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _pose(name: str, entries: Mapping[str, Any], metres: float) -> Array:
+    """Return world_from_cam (4, 4), metres."""
+    pose = np.eye(4)
+    if "position" in entries:
+        from scipy.spatial.transform import Rotation
+
+        quaternion = _numbers("quaternion_xyzw", entries["quaternion_xyzw"], (4,), "four numbers x, y, z, w")
+        norm = np.linalg.norm(quaternion)
+        if not abs(norm - 1) < ROUNDED:
+            raise CalibrationError(f"quaternion_xyzw must have length 1, got {norm:.3g}")
+        pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+        pose[:3, 3] = _numbers("position", entries["position"], (3,), "three numbers x, y, z") * metres
+        return pose
+    key = "world_from_cam" if "world_from_cam" in entries else "cam_from_world"
+    numbers = _numbers(key, entries[key], (12, 16), "4 (or the first 3) rows of 4 numbers")
+    pose[: len(numbers) // 4] = numbers.reshape(-1, 4)
+    pose[:3, 3] *= metres
+    pose[:3, :3] = _nearest_rotation(f"camera {name!r}: {key}", pose[:3, :3])
+    return pose if key == "world_from_cam" else invert_rigid(pose)
+
+
+def _nearest_rotation(name: str, matrix: Array) -> Array:
+    """Return the rotation closest to a rounded one; a matrix that is more than rounded is returned as it is.
+
+    `Camera` rejects the latter.
+    """
+    if not np.isfinite(matrix).all():
+        return matrix
+    deviation = np.abs(matrix.T @ matrix - np.eye(3)).max()
+    if not 1e-6 < deviation <= ROUNDED or np.linalg.det(matrix) < 0:
+        return matrix
+    left, _, right = np.linalg.svd(matrix)
+    nearest: Array = left @ right
+    if deviation > 1e-4:
+        change = np.abs(nearest - matrix).max()
+        logger.info(
+            "%s is not orthonormal (deviation %.2g): the nearest rotation differs by %.2g", name, deviation, change
+        )
+    return nearest
+
+
+def _numbers(name: str, value: Any, counts: tuple[int, ...], expected: str) -> Array:
     try:
-        return np.array(entries[name], dtype=np.float64).reshape(side, side)
+        numbers = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        raise CalibrationError(f"{name} must be {side} rows of {side} numbers, got {entries[name]!r}") from None
+        numbers = np.empty(0)
+    if len(numbers) not in counts:
+        raise CalibrationError(f"{name} must be {expected}, got {value!r}")
+    return numbers
 
 
 def _as_float32(matrix: Array) -> Array:

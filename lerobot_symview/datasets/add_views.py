@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
+from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.derivation import (
     MADE_FROM,
     Derivation,
@@ -25,8 +26,9 @@ from lerobot_symview.datasets.derivation import (
 from lerobot_symview.datasets.features import Features, calibration_features, stored_workspace, view_features
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, gripper_dimensions
-from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.workspace import Workspace, check_visible
+from lerobot_symview.geometry.units import parse_unit
+from lerobot_symview.geometry.visibility import check_camera
+from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, plain, remove_partial
@@ -66,6 +68,9 @@ class AddViewsConfig:
     """Options of the view persp."""
     calibration: Path | None = None
     """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
+    depth_unit: str | None = None
+    """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
+    default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
     workspace: Workspace | None = None
     """Square on the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
     default that of the calibration file, else of the dataset, else of the simulator. The gripper's x and y are relative
@@ -86,6 +91,7 @@ class AddViewsConfig:
         if self.new_repo_id:
             check_repo_id(self.new_repo_id, "--new_repo_id")
         self.make_views()
+        unit_from_flag(self.depth_unit)
 
     def make_views(self) -> dict[str, View]:
         """Return the views by name.
@@ -164,7 +170,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     added: Features = {}
     if calibration is not None:
         with flagged(f"--calibration={config.calibration}"):
-            check_visible(config.camera, calibration.camera(config.camera), workspace, "check the poses in the file")
+            check_camera(config.camera, calibration.camera(config.camera), workspace)
         added |= calibration_features(config.camera)
     stored_calibration = plain_calibration(calibration) if calibration is not None else None
     for name, view in views.items():
@@ -178,6 +184,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
     with flagged(f"--camera={config.camera}, --calibration"):
         reader.check()
+        reader = with_depth_unit(reader, unit_from_flag(config.depth_unit))
     _check_names(config, source.features, added)
     source.check_files([key for key in source.features if key not in dropped or key in reader.features()])
     return Derivation(
@@ -188,6 +195,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         views,
         workspace,
         calibration,
+        reader.depth_unit,
         dropped,
         added,
         derived_schema(source, dropped, added),
@@ -203,6 +211,20 @@ def calibration_and_workspace(
     with flagged("--calibration"):
         calibration = read_calibration(file)
     return calibration, workspace or calibration.workspace or stored_workspace(features)
+
+
+def unit_from_flag(depth_unit: str | None) -> float | None:
+    """Return the metres per unit of `--depth_unit`; None if it is not given.
+
+    Raises:
+        ValueError: if it is no unit.
+    """
+    if depth_unit is None:
+        return None
+    try:
+        return parse_unit(depth_unit)
+    except ValueError as error:
+        raise ValueError(f"--depth_unit: {error}") from None
 
 
 def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, View]:
@@ -233,16 +255,11 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
 def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
     """Render the first frame, so that errors that concern every frame are raised before anything is written."""
     reader = derivation.reader(source)
+    with flagged(f"--camera={derivation.camera}, --calibration, --depth_unit"):
+        check_calibration(reader)
     frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
     for view in derivation.views.values():
         view.render(frame)
-    if derivation.calibration is None:
-        try:
-            check_visible(
-                derivation.camera, frame.camera, derivation.workspace, "views will be empty outside its image"
-            )
-        except CalibrationError as error:
-            logger.warning("%s", error)
 
 
 def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, Any]:
@@ -256,6 +273,7 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "views": {name: asdict(view) for name, view in derivation.views.items()},
             "workspace": asdict(derivation.workspace),
             "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
+            "depth_unit": derivation.depth_unit,
             "left_out": derivation.dropped,
             "symview": version("lerobot_policy_symview"),
         }

@@ -55,6 +55,8 @@ class Derivation:
     """Square on the table that the views show."""
     calibration: Calibration | None
     """Calibration of the camera if it is not in the source; it is added to the result."""
+    depth_unit: float | None
+    """Metres per unit of the camera's depth; None as the source declares."""
     dropped: list[str]
     """Keys of the source features that are not copied."""
     added: Features
@@ -73,7 +75,7 @@ class Derivation:
 
     def reader(self, source: SourceDataset) -> FrameReader:
         """Return a reader of the frames that the views are rendered from."""
-        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration)
+        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration, self.depth_unit)
 
     def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
         """Return `rgb` or `height` for every new image feature."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError, DatasetError
-from lerobot_symview.geometry.units import UNIT_NAMES, Unit
+from lerobot_symview.geometry.units import UNIT_NAMES
 from lerobot_symview.geometry.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -73,8 +74,8 @@ def view_features(
     }
 
 
-def declared_unit(feature: dict[str, Any]) -> Unit | None:
-    """Return the unit that a depth feature declares, LeRobot's `info["depth_unit"]`; None if it declares none.
+def declared_unit(feature: dict[str, Any]) -> float | None:
+    """Return the metres per unit of a depth feature by LeRobot's `info["depth_unit"]`; None if it declares none.
 
     Raises:
         DatasetError: if the unit is neither `m` nor `mm`.
@@ -82,7 +83,22 @@ def declared_unit(feature: dict[str, Any]) -> Unit | None:
     unit = (feature.get("info") or {}).get("depth_unit")
     if unit is not None and unit not in UNIT_NAMES:
         raise DatasetError(f"depth_unit must be one of {', '.join(UNIT_NAMES)}, got {unit!r}")
-    return unit
+    return None if unit is None else UNIT_NAMES[unit]
+
+
+def check_depth_size(camera: str, depth: Sequence[int], color: Sequence[int]) -> None:
+    """Raise a DatasetError unless the depth images of a camera have the size of its colour images.
+
+    Args:
+        camera: name of the camera.
+        depth: rows and columns of depth, as a feature's shape.
+        color: rows and columns of colour.
+    """
+    if tuple(depth[:2]) != tuple(color[:2]):
+        raise DatasetError(
+            f"{keys.depth(camera)} has {depth[0]} x {depth[1]} pixels, {keys.rgb(camera)} has {color[0]} x {color[1]}: "
+            "align depth to colour when recording, as rs.align(rs.stream.color) does for a RealSense"
+        )
 
 
 def stored_workspace(features: Features) -> Workspace:

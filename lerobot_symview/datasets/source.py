@@ -22,12 +22,12 @@ from pyarrow.compute import struct_field
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.features import Features, declared_unit
+from lerobot_symview.datasets.features import Features, check_depth_size, declared_unit
 from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb, encoded_size
 from lerobot_symview.datasets.metadata import is_count, pixels, read_info
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, stored_camera
-from lerobot_symview.geometry.units import UNIT_NAMES, Unit, in_metres, infer_depth_unit
+from lerobot_symview.geometry.units import METRES, MILLIMETRES, in_metres, infer_depth_unit, unit_name
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, View
 
@@ -51,7 +51,7 @@ class SourceDataset:
     def __init__(self, folder: Path):
         self.folder = folder
         self.info = read_info(folder)
-        self._units: dict[str, Unit] = {}
+        self._units: dict[str, float] = {}
 
     @property
     def features(self) -> Features:
@@ -147,53 +147,61 @@ class SourceDataset:
                 f"the dataset in {self.folder} lacks {', '.join(missing[:3])}{more}: download or copy it again"
             )
 
-    def images(self, key: str, episode: int, table: pa.Table) -> Iterator[NDArray]:
+    def images(self, key: str, episode: int, table: pa.Table, depth_unit: float | None = None) -> Iterator[NDArray]:
         """Decode an image or video feature: (H, W, 3) uint8 colour, or (H, W) float32 depth or height, metres.
 
         Args:
             key: key of the feature.
             episode: index of the episode.
             table: rows of the episode; one image is decoded per row.
+            depth_unit: metres per unit of a depth feature; by default as in `depth_unit`. In a video, of the integers
+                that were encoded: LeRobot takes them for millimetres.
         """
         feature = self.features[key]
         if feature["dtype"] == "video":
-            yield from self._video_frames(key, episode, table["timestamp"].to_numpy())
+            scale = 1.0 if depth_unit is None else depth_unit / MILLIMETRES
+            for image in self._video_frames(key, episode, table["timestamp"].to_numpy()):
+                yield image if scale == 1 else image * np.float32(scale)
             return
         encoded, paths = (struct_field(table[key], part) for part in ("bytes", "path"))
         for index, image in enumerate(encoded):
             data = image.as_buffer()
             if data is None:
                 raise ValueError(f"{key}: expected an image in the table, got none; its path is {paths[index]}")
-            yield self.decode(key, data)
+            yield self.decode(key, data, depth_unit)
 
-    def decode(self, key: str, data: Buffer) -> NDArray:
+    def decode(self, key: str, data: Buffer, depth_unit: float | None = None) -> NDArray:
         """Decode one image of an image feature, as `images` yields it."""
         feature = self.features[key]
         self._check_size(key, *encoded_size(data))
         if not is_depth_feature(feature):
             return decode_rgb(data)
-        return in_metres(decode_depth(data), self.depth_unit(key)).astype(np.float32, copy=False)
+        return in_metres(decode_depth(data), depth_unit or self.depth_unit(key)).astype(np.float32, copy=False)
 
-    def depth_unit(self, key: str) -> Unit:
-        """Return the unit of a stored depth or height feature.
+    def depth_unit(self, key: str) -> float:
+        """Return the metres per unit of a stored depth or height feature.
 
-        This is the declared unit (`info["depth_unit"]`). An undeclared unit is inferred from the first image with a
-        valid pixel, and logged.
+        This is the declared unit (`info["depth_unit"]`). An undeclared unit is inferred from the values of the first
+        image with a valid pixel, and logged.
         """
         if key not in self._units:
             self._units[key] = declared_unit(self.features[key]) or self._inferred_unit(key)
         return self._units[key]
 
-    def _inferred_unit(self, key: str) -> Unit:
+    def _inferred_unit(self, key: str) -> float:
+        stored = self.first_depth(key)
+        unit = METRES if stored is None else infer_depth_unit(stored[1])
+        logger.info("%s declares no depth_unit: its values are taken to be %s", key, unit_name(unit))
+        return unit
+
+    def first_depth(self, key: str) -> tuple[int, NDArray] | None:
+        """Return the first stored depth image of episode 0 with a valid pixel, as stored, and its frame's index."""
         table = EpisodeTables(self, self.data_file(0), [key]).read(0)
-        unit: Unit = "m"
-        for encoded in struct_field(table[key], "bytes"):
+        for index, encoded in enumerate(struct_field(table[key], "bytes")):
             depth = decode_depth(encoded.as_buffer())
             if (depth > 0).any():
-                unit = infer_depth_unit(depth)
-                break
-        logger.info("%s declares no depth_unit: its values are taken to be %s", key, UNIT_NAMES[unit])
-        return unit
+                return index, depth
+        return None
 
     def _check_size(self, key: str, height: int, width: int) -> None:
         shape = self.features[key]["shape"]
@@ -288,6 +296,7 @@ class FrameReader:
         workspace: the square on the table that views show.
         views: the views to render; they determine whether depth and the gripper's state are read.
         calibration: calibration of the camera if it is not in the dataset.
+        depth_unit: metres per unit of the camera's depth; by default what the dataset declares, or its values suggest.
     """
 
     dataset: SourceDataset
@@ -295,6 +304,7 @@ class FrameReader:
     workspace: Workspace
     views: Collection[View]
     calibration: Calibration | None = None
+    depth_unit: float | None = None
 
     @property
     def depth(self) -> bool:
@@ -327,6 +337,8 @@ class FrameReader:
         depth = keys.depth(self.camera)
         if self.depth and depth in features and not is_depth_feature(features[depth]):
             missing.append(f"{depth} as a depth feature")
+        if self.depth and depth not in missing and depth in features:
+            check_depth_size(self.camera, features[depth]["shape"], features[keys.rgb(self.camera)]["shape"])
         if missing:
             cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
             raise DatasetError(
@@ -340,7 +352,9 @@ class FrameReader:
             CalibrationError: if a frame's calibration is invalid.
         """
         colors = self.dataset.images(keys.rgb(self.camera), episode, table)
-        depths = self.dataset.images(keys.depth(self.camera), episode, table) if self.depth else repeat(None)
+        depths: Iterator[Any] = repeat(None)
+        if self.depth:
+            depths = self.dataset.images(keys.depth(self.camera), episode, table, self.depth_unit)
         states: Iterator[Any] = repeat(None)
         if self.gripper:
             states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])

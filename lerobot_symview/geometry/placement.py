@@ -7,7 +7,8 @@ from dataclasses import astuple, dataclass, field, replace
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array, Camera, intrinsics_from_fov, orbit_pose
-from lerobot_symview.geometry.workspace import MINIMUM_VISIBLE, Workspace, check_visible
+from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
+from lerobot_symview.geometry.workspace import Workspace
 
 TOP_DISTANCE = 8.0  # metres: at this distance perspective shifts the top of a 5 cm block by less than a millimetre
 TRIES = 100
@@ -111,8 +112,9 @@ class CameraSpec:
             if workspace.visible_fraction(camera) >= minimum_visible:
                 break
             camera = self._camera(workspace, rng)
-        remedy = "raise its distance or fov_deg, point it at the workspace, or lower its spread"
-        check_visible(self.name, camera, workspace, remedy, minimum_visible)
+        angles = "raise its distance or fov_deg, point it at the workspace, or lower its spread"
+        remedy = angles if self.world_from_cam is None else ""
+        check_camera(self.name, camera, workspace, remedy, minimum_visible)
         return camera
 
     def _camera(self, workspace: Workspace, rng: np.random.Generator | None) -> Camera:

@@ -1,36 +1,66 @@
-"""Units of depth and height images. Dataset readers and the policies' first processor step convert all to metres."""
+"""Units of depth and height images. Dataset readers and the policies' first processor step convert all to metres.
+
+A unit is a number: metres per stored unit.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Unit = Literal["m", "mm"]
-UNIT_NAMES: dict[Unit, str] = {"m": "metres", "mm": "millimetres"}
-MILLIMETRES_PER_METRE = 1000.0
+METRES, MILLIMETRES = 1.0, 0.001
+UNIT_NAMES = {"m": METRES, "mm": MILLIMETRES}
 METRES_AT_MOST = 10.0  # table scenes have no larger value in metres, and cameras measure no depth below 10 mm
 
 
-def in_metres(depth: NDArray, unit: Unit | None = None) -> NDArray[np.floating]:
+def parse_unit(value: Any) -> float:
+    """Return the metres per unit of `m`, `mm`, or a positive number such as 0.0001, also as text.
+
+    Raises:
+        ValueError: if `value` is none of them.
+    """
+    try:
+        unit = UNIT_NAMES[value] if value in UNIT_NAMES else float(value)
+    except (TypeError, ValueError):
+        unit = math.nan
+    if isinstance(value, bool) or not 0 < unit < math.inf:
+        raise ValueError(f"a depth unit must be m, mm or a positive number of metres such as 0.0001, got {value!r}")
+    return unit
+
+
+def unit_name(unit: float) -> str:
+    """Return a unit in words."""
+    return {METRES: "metres", MILLIMETRES: "millimetres"}.get(unit, f"units of {unit:g} m")
+
+
+def in_metres(depth: NDArray, unit: float | None = None) -> NDArray[np.floating]:
     """Convert a depth or height image to metres.
 
     Args:
         depth: any shape, float or integer.
-        unit: unit of `depth`; None is LeRobot's convention, float metres and integer millimetres (as from a RealSense).
+        unit: metres per unit of `depth`; None is LeRobot's convention, float metres and integer millimetres.
 
     Returns:
         The same shape; float32 for integer input, else the dtype of `depth`.
     """
     is_float = np.issubdtype(depth.dtype, np.floating)
-    if unit == "m" or (unit is None and is_float):
-        return depth if is_float else depth.astype(np.float32)
-    return (depth if is_float else depth.astype(np.float32)) / np.float32(MILLIMETRES_PER_METRE)
+    if unit is None:
+        unit = METRES if is_float else MILLIMETRES
+    depth = depth if is_float else depth.astype(np.float32)
+    return depth if unit == METRES else depth / np.float32(units_per_metre(unit))
 
 
-def infer_depth_unit(depth: Any) -> Unit:
-    """Return the most likely unit of depth images whose feature declares none.
+def units_per_metre(unit: float) -> float:
+    """Return the divisor that converts to metres: a whole number where the unit is a fraction of a metre."""
+    divisor = 1 / unit
+    return round(divisor) if math.isclose(divisor, round(divisor)) else divisor
+
+
+def infer_depth_unit(depth: Any) -> float:
+    """Return the most likely unit of depth images whose feature declares none, from their values alone.
 
     Integers are millimetres. Floats are millimetres if most valid pixels exceed 10: a camera over a table measures no
     depth below 10 mm and few beyond 10 m. The majority decides, so that outliers do not matter.
@@ -40,13 +70,13 @@ def infer_depth_unit(depth: Any) -> Unit:
     """
     xp = _array_namespace(depth)
     if not xp.isdtype(depth.dtype, "real floating"):
-        return "mm"
+        return MILLIMETRES
     valid = xp.isfinite(depth) & (depth > 0)
     large = valid & (depth > METRES_AT_MOST)
-    return "mm" if bool(2 * xp.sum(large) > xp.sum(valid)) else "m"
+    return MILLIMETRES if bool(2 * xp.sum(large) > xp.sum(valid)) else METRES
 
 
-def infer_height_unit(heights: Any) -> Unit:
+def infer_height_unit(heights: Any) -> float:
     """Return the most likely unit of height maps whose feature declares none.
 
     Floats are millimetres if any height exceeds 10: most of a table is empty, so the majority cannot decide. A map in
@@ -57,8 +87,8 @@ def infer_height_unit(heights: Any) -> Unit:
     """
     xp = _array_namespace(heights)
     if not xp.isdtype(heights.dtype, "real floating"):
-        return "mm"
-    return "mm" if bool(xp.any(xp.isfinite(heights) & (heights > METRES_AT_MOST))) else "m"
+        return MILLIMETRES
+    return MILLIMETRES if bool(xp.any(xp.isfinite(heights) & (heights > METRES_AT_MOST))) else METRES
 
 
 def _array_namespace(array: Any) -> Any:

@@ -6,10 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera, project
-
-MINIMUM_VISIBLE = 0.6  # fraction of the working volume
 
 
 @dataclass(frozen=True)
@@ -63,18 +60,3 @@ class Workspace:
         pixels, depth = project(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), camera)
         inside = (pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])
         return float((inside.all(axis=-1) & (depth > 0)).mean())
-
-
-def check_visible(
-    name: str, camera: Camera, workspace: Workspace, remedy: str, minimum: float = MINIMUM_VISIBLE
-) -> None:
-    """Raise an error if too little of the working volume is in the camera's image.
-
-    Raises:
-        CalibrationError: if less than `minimum` of the working volume is visible; the message ends with `remedy`.
-    """
-    visible = workspace.visible_fraction(camera)
-    if visible < minimum:
-        raise CalibrationError(
-            f"camera {name!r} sees {visible:.0%} of the workspace, expected at least {minimum:.0%}: {remedy}"
-        )

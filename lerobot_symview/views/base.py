@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import Registry
 
@@ -39,6 +40,7 @@ class Frame:
 
     Raises:
         ValueError: if an image's shape or dtype is wrong, or the gripper's state is not finite.
+        CalibrationError: if the camera is below the table.
     """
 
     rgb: NDArray[np.uint8]
@@ -48,6 +50,7 @@ class Frame:
     gripper: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
+        check_above_table(self.camera)
         # Compiled kernels index the images by the camera's size without bounds checks.
         size = (self.camera.height, self.camera.width)
         if self.rgb.shape != (*size, 3) or self.rgb.dtype != np.uint8:

@@ -15,6 +15,7 @@ from torch import Tensor
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.homography import warp_map
+from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.geometry.zbuffer import EMPTY, grid_from_pixel
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, check_gripper
@@ -37,6 +38,7 @@ class FrameBatch:
 
     Raises:
         ValueError: if the number of cameras is not B, an image's size differs from its camera's, or a dtype is wrong.
+        CalibrationError: if a camera is below the table.
     """
 
     rgb: Tensor
@@ -49,6 +51,8 @@ class FrameBatch:
         count, rows, columns = len(self.rgb), *self.rgb.shape[-2:]
         if self.rgb.shape != (count, 3, rows, columns) or self.rgb.dtype != torch.uint8:
             raise ValueError(f"rgb must be (B, 3, H, W) uint8, got {tuple(self.rgb.shape)} {self.rgb.dtype}")
+        for camera in self.cameras:
+            check_above_table(camera)
         if len(self.cameras) != count:
             raise ValueError(f"{count} frames need {count} cameras, got {len(self.cameras)}")
         sizes = {(camera.height, camera.width) for camera in self.cameras}

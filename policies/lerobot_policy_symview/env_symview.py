@@ -14,7 +14,7 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
-from lerobot_symview.geometry.units import Unit
+from lerobot_symview.geometry.units import METRES
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_sim.settings import EnvSettings
@@ -105,7 +105,7 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """Return the preprocessor, which adds `views` and declares depth in metres, and an empty postprocessor."""
         views = [ViewSpec(name, asdict(view)).plain() for name, view in self._make_views().items()]
-        depth_units: dict[str, Unit] = dict.fromkeys((key for key in self.features if key.endswith("_depth")), "m")
+        depth_units: dict[str, float] = dict.fromkeys((key for key in self.features if key.endswith("_depth")), METRES)
         step = ViewsProcessorStep(
             views=views, camera=self.camera.name, workspace=asdict(self.workspace), depth_units=depth_units
         )

@@ -10,13 +10,12 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.processor_views import ViewsProcessorStep, delivered_units
-from lerobot_symview.geometry.units import Unit
 
 
 def make_processors(
     config: SymviewConfig,
     dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None,
-    depth_units: dict[str, Unit] | None = None,
+    depth_units: dict[str, float] | None = None,
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
@@ -27,8 +26,8 @@ def make_processors(
     Args:
         config: the policy's configuration.
         dataset_stats: dataset statistics for LeRobot's normaliser.
-        depth_units: feature -> unit of float depth; by default the units in which LeRobot's loader delivers the depth
-            features of the training dataset.
+        depth_units: feature -> metres per unit of depth; by default the units in which LeRobot's loader delivers the
+            depth features of the training dataset.
 
     Raises:
         ValueError: if the view uses the gripper's pose and the declared state lacks it.

@@ -16,10 +16,19 @@ from torch import Tensor
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
-from lerobot_symview.datasets.features import declared_unit
+from lerobot_symview.datasets.features import check_depth_size, declared_unit
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera, stored_camera
-from lerobot_symview.geometry.units import MILLIMETRES_PER_METRE, UNIT_NAMES, Unit, infer_depth_unit, infer_height_unit
+from lerobot_symview.geometry.units import (
+    METRES,
+    MILLIMETRES,
+    infer_depth_unit,
+    infer_height_unit,
+    parse_unit,
+    unit_name,
+    units_per_metre,
+)
+from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.views import Frame, View, ViewSpec, make_views
 
 if TYPE_CHECKING:
@@ -45,9 +54,14 @@ class ViewsProcessorStep(ObservationProcessorStep):
         calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
         gripper: indices of the gripper's x, y, z, yaw and aperture in `observation.state`; none where the gripper's
             state is unknown: then nothing is clipped and no gripper image is drawn.
-        depth_units: feature -> `m` or `mm`, the unit in which float depth and height images arrive; the units of others
-            are inferred from their values, which is logged. Integers are millimetres. It is not stored in checkpoints:
-            LeRobot's loader delivers millimetres where an environment delivers metres.
+        depth_units: feature -> `m`, `mm` or metres per unit, the unit in which depth and height images arrive. It is
+            not stored in checkpoints: LeRobot's loader delivers millimetres where an environment delivers metres. Units
+            that are not given are the calibration's; else, for `camera`, the one that shows the table at z = 0; else
+            they are inferred from the values. What is inferred is logged.
+
+    Raises (from `observation`):
+        CalibrationError: if the first observation contradicts the calibration: the camera is below the table, too far
+            away for the workspace, or its depth shows the table elsewhere or nothing.
     """
 
     views: list[Any] = field(default_factory=list)
@@ -55,7 +69,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
     workspace: dict[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
     gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
-    depth_units: dict[str, Unit] = field(default_factory=dict)
+    depth_units: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not isinstance(self.views, list | tuple):
@@ -68,7 +82,14 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._fixed_camera = calibration.camera(self.camera) if calibration else None
         default = calibration.workspace if calibration and not self.workspace else None
         self._workspace = default or parse_workspace(self.workspace)
-        self._logged: set[tuple[str, Unit]] = set()
+        if self._fixed_camera is not None:
+            check_camera(self.camera, self._fixed_camera, self._workspace)
+        calibrated = calibration.depth_units.get(self.camera) if calibration else None
+        self._units = {} if calibrated is None else {keys.depth(self.camera): calibrated}
+        self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
+        self._table_units: dict[tuple[str, torch.dtype], float] = {}
+        self._logged: set[tuple[str, float]] = set()
+        self._checked = False
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
@@ -83,6 +104,9 @@ class ViewsProcessorStep(ObservationProcessorStep):
         needs_depth = any(view.needs_depth for view in missing.values())
         uses_gripper = any(view.uses_gripper for view in missing.values())
         batch = self._batch(observation, list(missing), needs_depth, uses_gripper)
+        if not self._checked:
+            self._check(batch)
+            self._checked = True
         for view in missing.values():
             for output, images in _render(view, batch).items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
@@ -104,7 +128,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         if IN_METRES in observation:
             return observation
         converted = {
-            key: _metres(values.detach(), self._unit(key, values))
+            key: _metres(values.detach(), self._unit(key, values.detach(), observation))
             for key, values in observation.items()
             if key.startswith(keys.rgb("")) and key.endswith(("_depth", "_height"))
         }
@@ -112,16 +136,49 @@ class ViewsProcessorStep(ObservationProcessorStep):
             return observation
         return {**observation, **converted, IN_METRES: torch.ones(())}
 
-    def _unit(self, key: str, values: Tensor) -> Unit:
-        if not values.is_floating_point():
-            return "mm"
-        if key in self.depth_units:
-            return self.depth_units[key]
-        unit = (infer_height_unit if key.endswith("_height") else infer_depth_unit)(values.detach())
-        if (key, unit) not in self._logged:
+    def _unit(self, key: str, values: Tensor, observation: RobotObservation) -> float:
+        unit = self._units.get(key) or self._table_units.get((key, values.dtype))
+        if unit is not None:
+            return unit
+        if key == keys.depth(self.camera) and (unit := self._unit_by_table(values, observation)) is not None:
+            self._table_units[key, values.dtype] = unit
+            logger.info("%s declares no unit: the table at z = 0 shows %s", key, unit_name(unit))
+            return unit
+        unit = (infer_height_unit if key.endswith("_height") else infer_depth_unit)(values)
+        if values.is_floating_point() and (key, unit) not in self._logged:
             self._logged.add((key, unit))
-            logger.info("%s declares no unit: its values are taken to be %s", key, UNIT_NAMES[unit])
+            logger.info("%s declares no unit: its values are taken to be %s", key, unit_name(unit))
         return unit
+
+    def _unit_by_table(self, depth: Tensor, observation: RobotObservation) -> float | None:
+        from lerobot_symview.calibration.table_plane import likely_depth_unit
+
+        color = observation.get(keys.rgb(self.camera))
+        if self._missing_matrices(observation) or not depth.numel() or color is None:
+            return None
+        if depth.shape[-2:] != color.shape[-2:]:
+            return None  # `_batch` rejects it
+        height, width = depth.shape[-2:]
+        camera = self._cameras(observation, len(depth), height, width)[0]
+        return likely_depth_unit(depth[0].reshape(height, width).cpu().numpy(), camera, self._workspace)
+
+    def _check(self, batch: FrameBatch) -> None:
+        """Raise a CalibrationError if the first frame contradicts the calibration."""
+        from lerobot_symview.calibration.table_plane import check_table, has_depth
+
+        camera = batch.cameras[0]
+        check_camera(self.camera, camera, self._workspace, minimum=0.0)
+        if batch.depth is None:
+            return
+        key, depth = keys.depth(self.camera), batch.depth[0].cpu().numpy()
+        if not has_depth(depth, camera, self._workspace):
+            raise CalibrationError(
+                f"{key} has no valid pixel in the workspace: check the camera, its pose and its lens"
+            )
+        try:
+            check_table(depth, camera, self._workspace, self._units.get(key))
+        except CalibrationError as error:
+            raise CalibrationError(f"{key}: {error}") from None
 
     def _batch(
         self, observation: RobotObservation, views: list[str], needs_depth: bool, uses_gripper: bool
@@ -131,20 +188,16 @@ class ViewsProcessorStep(ObservationProcessorStep):
         color, depth = keys.rgb(self.camera), keys.depth(self.camera)
         uses_gripper = uses_gripper and bool(self.gripper)
         needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if uses_gripper else [])
-        matrices = {keys.intrinsics(self.camera): 3, keys.world_from_cam(self.camera): 4}
-        own = self._fixed_camera is None or all(key in observation for key in matrices)
-        missing = [key for key in needed + (list(matrices) if own else []) if key not in observation]
+        missing = [key for key in needed if key not in observation] + self._missing_matrices(observation)
         if missing:
             raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
         rgb = observation[color].detach()
         if rgb.dtype != torch.uint8:
             rgb = (rgb * 255).round().to(torch.uint8)
         height, width = rgb.shape[2:]
-        if own:
-            stored = (_matrices(key, observation[key], side, len(rgb)) for key, side in matrices.items())
-            cameras = [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
-        else:
-            cameras = [self._calibrated_camera(height, width)] * len(rgb)
+        cameras = self._cameras(observation, len(rgb), height, width)
+        if needs_depth:
+            check_depth_size(self.camera, observation[depth].shape[-2:], (height, width))
         return FrameBatch(
             rgb,
             observation[depth][:, 0] if needs_depth else None,
@@ -153,18 +206,32 @@ class ViewsProcessorStep(ObservationProcessorStep):
             observation[keys.STATE].detach()[:, self.gripper] if uses_gripper else None,
         )
 
-    def _calibrated_camera(self, height: int, width: int) -> Camera:
-        assert self._fixed_camera is not None
-        if (height, width) != (self._fixed_camera.height, self._fixed_camera.width):
+    def _missing_matrices(self, observation: RobotObservation) -> list[str]:
+        """Return the calibration's keys that the observation lacks, where the step has no calibration of its own."""
+        return [] if self._fixed_camera is not None else [key for key in self._matrix_keys if key not in observation]
+
+    @property
+    def _matrix_keys(self) -> dict[str, int]:
+        """Keys of an observation's calibration -> rows of the matrix."""
+        return {keys.intrinsics(self.camera): 3, keys.world_from_cam(self.camera): 4}
+
+    def _cameras(self, observation: RobotObservation, count: int, height: int, width: int) -> list[Camera]:
+        """Return the camera of each of `count` frames: the observation's, else the step's own."""
+        if all(key in observation for key in self._matrix_keys):
+            stored = (_matrices(key, observation[key], side, count) for key, side in self._matrix_keys.items())
+            return [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
+        camera = self._fixed_camera
+        assert camera is not None
+        if (height, width) != (camera.height, camera.width):
             raise CalibrationError(
-                f"camera {self.camera!r} is calibrated for {self._fixed_camera.height} x {self._fixed_camera.width} "
-                f"pixels, the observation has {height} x {width}"
+                f"camera {self.camera!r} is calibrated for {camera.height} x {camera.width} pixels, "
+                f"the observation has {height} x {width}"
             )
-        return self._fixed_camera
+        return [camera] * count
 
 
-def delivered_units(meta: Any) -> dict[str, Unit]:
-    """Return the unit in which LeRobot's loader delivers each depth feature that declares one.
+def delivered_units(meta: Any) -> dict[str, float]:
+    """Return the metres per unit in which LeRobot's loader delivers each depth feature that declares its unit.
 
     The loader converts to `--dataset.depth_output_unit`, which it does not pass on; it rescales the statistics to the
     same unit, so these tell (`LeRobotDatasetMetadata.rescale_depth_stats`).
@@ -175,20 +242,20 @@ def delivered_units(meta: Any) -> dict[str, Unit]:
     from lerobot.datasets.io_utils import load_stats
 
     stored_stats = load_stats(meta.root) or {}
-    units: dict[str, Unit] = {}
+    units: dict[str, float] = {}
     for key in meta.depth_keys:
-        unit: Unit | None = declared_unit(meta.features[key])
+        unit = declared_unit(meta.features[key])
         if unit is None or key not in stored_stats or key not in (meta.stats or {}):
             continue
         same = np.allclose(meta.stats[key]["max"], stored_stats[key]["max"])
-        units[key] = unit if same else ("m" if unit == "mm" else "mm")
+        units[key] = unit if same else (METRES if unit == MILLIMETRES else MILLIMETRES)
     return units
 
 
-def _metres(depth: Tensor, unit: Unit) -> Tensor:
+def _metres(depth: Tensor, unit: float) -> Tensor:
     depth = depth if depth.is_floating_point() else depth.float()
     # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which rounds differently.
-    return depth if unit == "m" else depth / depth.new_full((), MILLIMETRES_PER_METRE)
+    return depth if unit == METRES else depth / depth.new_full((), units_per_metre(unit))
 
 
 def _matrices(key: str, matrix: Tensor, side: int, count: int) -> NDArray[np.floating]:

@@ -1,4 +1,4 @@
-"""Configurations of `add_views`, contents of folders, and modified datasets."""
+"""Configurations of `add_views`, contents of folders, and recorded and modified datasets."""
 
 import json
 
@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_depth, encode_metres
@@ -45,3 +46,38 @@ def rewrite_depth(folder, key, change):
         column = table.schema.get_field_index(key)
         changed = pa.array(cells, table.field(column).type)
         pq.write_table(table.set_column(column, table.field(column), changed), file)
+
+
+def in_mm(depth, unit=0.001):
+    """Depth in metres as a camera stores it: uint16, by default millimetres."""
+    return np.rint(depth / unit).astype(np.uint16)
+
+
+def record_real_robot(folder, rgb, depth, use_videos=False, **depth_info):
+    """Record three frames of a robot with joint angles and an RGBD camera `front` without calibration."""
+    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
+    axes = ["height", "width", "channels"]
+    dataset = LeRobotDataset.create(
+        "test/real",
+        fps=10,
+        root=folder,
+        use_videos=use_videos,
+        features={
+            keys.STATE: joints,
+            keys.ACTION: joints,
+            keys.rgb("front"): {"dtype": "video" if use_videos else "image", "shape": rgb.shape, "names": axes},
+            keys.depth("front"): {
+                "dtype": "image",
+                "shape": (*depth.shape, 1),
+                "names": axes,
+                "info": {"is_depth_map": True} | depth_info,
+            },
+        },
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        angles = rng.normal(size=6).astype(np.float32)
+        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth[..., None], keys.STATE: angles, keys.ACTION: angles}
+        dataset.add_frame(frame | {"task": "none"})
+    dataset.save_episode()
+    dataset.finalize()

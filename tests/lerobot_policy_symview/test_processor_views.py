@@ -12,6 +12,7 @@ from lerobot_policy_symview.rl.rollouts import simulator_config
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import stored_camera
+from lerobot_symview.geometry.units import UNIT_NAMES
 from lerobot_symview.geometry.units import in_metres as in_metres_offline
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view
@@ -280,7 +281,7 @@ def test_depth_is_converted_once():
 def test_delivered_units_match_lerobots_loader(with_views, output_unit):
     dataset = LeRobotDataset("test/with_views", root=with_views, depth_output_unit=output_unit)
     units = delivered_units(dataset.meta)
-    assert units[DEPTH] == units[HEIGHT] == output_unit
+    assert units[DEPTH] == units[HEIGHT] == UNIT_NAMES[output_unit]
     made = metres(DEPTH, dataset[0][DEPTH][None], units=units)
     assert 0.3 < float(made.median()) < 2
 

@@ -19,7 +19,7 @@ from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
-from lerobot_symview.geometry.units import Unit
+from lerobot_symview.geometry.units import METRES
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Observation, Reset, SimulatorConfig, Simulators, Step
 
@@ -65,10 +65,10 @@ def _to_lerobot_layout(values: Tensor) -> Tensor:
     return values.float() / 255 if values.dtype == torch.uint8 else values
 
 
-def metric_depth(config: SymviewConfig) -> dict[str, Unit]:
+def metric_depth(config: SymviewConfig) -> dict[str, float]:
     """Return the unit of depth from simulators and from `open_dataset`: metres."""
     depth = [keys.depth(config.camera), keys.depth("top"), config.height_key]
-    return {key: "m" for key in depth if key is not None}
+    return {key: METRES for key in depth if key is not None}
 
 
 def simulator_config(config: SymviewConfig, env: EnvSettings) -> SimulatorConfig:

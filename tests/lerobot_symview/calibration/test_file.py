@@ -6,7 +6,8 @@ import yaml
 
 from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.workspace import Workspace, check_visible
+from lerobot_symview.geometry.visibility import check_camera
+from lerobot_symview.geometry.workspace import Workspace
 from tests.helpers.cameras import make_camera
 
 
@@ -56,7 +57,7 @@ def test_the_example_in_the_documentation_is_valid():
 
     example = module.__doc__.split("JSON:\n")[1]
     camera = parse_calibration(yaml.safe_load(example)).camera("front")
-    check_visible("front", camera, Workspace(), "")
+    check_camera("front", camera, Workspace())
 
 
 REFLECTED = np.diag([1.0, -1.0, 1.0, 1.0]).tolist()
@@ -70,17 +71,17 @@ STRETCHED = np.diag([1.1, 1.0, 1.0, 1.0]).tolist()
         ({"cameras": content()["cameras"]}, "units must be m or mm, got None"),
         (content() | {"units": "inch"}, "units must be m or mm, got 'inch'"),
         ({"units": "m"}, "at least one camera"),
-        (content() | {"cameras": {"front": {}}}, "lacks height, width, intrinsics, world_from_cam"),
+        (content() | {"cameras": {"front": {}}}, "lacks height, width, intrinsics; expected one of world_from_cam, "),
         (content(fov=3), "unknown keys: fov"),
         (content() | {"camera": 1}, "unknown keys: camera;"),
         (content(height=-3), "height must be a positive number of pixels, got -3"),
-        (content(intrinsics=[[1, 0], [0, 1]]), "intrinsics must be 3 rows of 3 numbers"),
+        (content(intrinsics=[[1, 0], [0, 1], [1, 1]]), "intrinsics must be fx, fy, cx, cy or 3 rows of 3 numbers"),
         (content(intrinsics=[[-60, 0, 31], [0, 60, 31], [0, 0, 1]]), "focal lengths must be positive"),
         (content(intrinsics=[[60, 0, 310], [0, 60, 31], [0, 0, 1]]), r"principal point .* lies outside"),
         (content(world_from_cam=REFLECTED), "left-handed"),
         (content(world_from_cam=STRETCHED), "not orthonormal"),
         (content(intrinsics=[[1e300, 0, 31], [0, 60, 31], [0, 0, 1]]), "must be finite"),
-        (content(world_from_cam="somewhere"), "world_from_cam must be 4 rows of 4 numbers"),
+        (content(world_from_cam="somewhere"), r"world_from_cam must be 4 \(or the first 3\) rows of 4 numbers"),
         (content() | {"workspace": {"size": -1}}, "workspace: .*positive"),
         (
             content() | {"workspace": {"side": 1}},

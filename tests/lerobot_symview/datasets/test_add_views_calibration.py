@@ -35,7 +35,7 @@ from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
 from tests.helpers.cameras import plane_depth
-from tests.helpers.datasets import images_of, views_config
+from tests.helpers.datasets import images_of, in_mm, record_real_robot, views_config
 
 NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 
@@ -106,7 +106,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         intrinsics = intrinsics_from_fov(0.9, 48, 64).astype(np.float32)
         camera = stored_camera(intrinsics.ravel(), pose.ravel(), 48, 64)
         rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
-        depth = plane_depth(camera, height=0.03).astype(np.float32)
+        depth = plane_depth(camera).astype(np.float32)
         expected.append(view.render(Frame(rgb, depth, camera, Workspace())))
         frame = {keys.rgb("wrist"): rgb, keys.depth("wrist"): depth[..., None], keys.ACTION: np.zeros(1, np.float32)}
         calibration = {keys.intrinsics("wrist"): intrinsics.ravel(), keys.world_from_cam("wrist"): pose.ravel()}
@@ -125,44 +125,11 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         assert index == 0 or (colors[index] != colors[index - 1]).any()
 
 
-def record_real_robot(folder, camera, rgb, use_videos=False):
-    """Record three frames with joint angles and RealSense depth in uint16 millimetres; return the depth."""
-    size = (camera.height, camera.width)
-    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
-    kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
-    source = LeRobotDataset.create(
-        "test/real",
-        fps=10,
-        root=folder,
-        use_videos=use_videos,
-        features={
-            keys.STATE: joints,
-            keys.ACTION: joints,
-            keys.rgb("front"): {"dtype": kind, "shape": (*size, 3), "names": axes},
-            keys.depth("front"): {
-                "dtype": "image",
-                "shape": (*size, 1),
-                "names": axes,
-                "info": {"is_depth_map": True},
-            },
-        },
-    )
-    depth = np.rint(1000 * plane_depth(camera, height=0.02)).astype(np.uint16)[..., None]
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        angles = rng.normal(size=6).astype(np.float32)
-        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
-        source.add_frame(frame | {"task": "none"})
-    source.save_episode()
-    source.finalize()
-    return depth
-
-
 @pytest.mark.parametrize("use_videos", [False, True])
 def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos):
     camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
     rgb = np.full((96, 128, 3), (200, 100, 50), dtype=np.uint8)
-    record_real_robot(tmp_path / "real", camera, rgb, use_videos)
+    record_real_robot(tmp_path / "real", rgb, in_mm(plane_depth(camera, height=0.02)), use_videos)
     file = tmp_path / "cameras.json"
     calibration = Calibration({"front": camera}, Workspace(size=0.3))
     file.write_text(json.dumps(plain_calibration(calibration)))
@@ -183,7 +150,8 @@ def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos
 def test_views_are_bit_identical_offline_online_and_from_stored_matrices(tmp_path):
     camera = Camera(intrinsics_from_fov(0.83, 96, 128), orbit_pose(0.91, 0.37, 0.81, (0.45, 0.01, 0.0)), 96, 128)
     rgb = np.random.default_rng(0).integers(0, 256, (96, 128, 3), dtype=np.uint8)
-    depth = record_real_robot(tmp_path / "real", camera, rgb)
+    depth = in_mm(plane_depth(camera, height=0.02))
+    record_real_robot(tmp_path / "real", rgb, depth)
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps(plain_calibration(Calibration({"front": camera}))))
     views = {
@@ -198,11 +166,11 @@ def test_views_are_bit_identical_offline_online_and_from_stored_matrices(tmp_pat
     matrices = {key: item[key] for key in (keys.intrinsics("front"), keys.world_from_cam("front"))}
     observed = {
         keys.rgb("front"): torch.from_numpy(rgb).permute(2, 0, 1)[None],
-        keys.depth("front"): torch.from_numpy(depth).permute(2, 0, 1)[None],
+        keys.depth("front"): torch.from_numpy(depth)[None, None],
     }
     online = ViewsProcessorStep(specs, "front", calibration=plain_calibration(read_calibration(file)))
     recomputed = Frame(
-        rgb, in_metres(depth[..., 0]), stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace()
+        rgb, in_metres(depth), stored_camera(*(m.numpy() for m in matrices.values()), 96, 128), Workspace()
     )
     for observation in (dict(observed), observed | matrices):
         images = online.observation(observation)
@@ -234,7 +202,7 @@ def test_a_calibration_file_that_misses_the_workspace_is_rejected(recorded, tmp_
     file.write_text(json.dumps(plain_calibration(Calibration({"side": camera}))))
     with pytest.raises(
         CalibrationError,
-        match=r"--calibration=.*cameras\.json: camera 'side' sees 0% of the workspace, .*check the poses",
+        match=r"--calibration=.*cameras\.json: camera 'side' sees 0% of the workspace, .*check its pose",
     ):
         add_views(views_config(recorded, tmp_path / "derived", calibration=file))
     assert list(tmp_path.iterdir()) == [file]
@@ -243,7 +211,7 @@ def test_a_calibration_file_that_misses_the_workspace_is_rejected(recorded, tmp_
 def test_a_recorded_camera_that_misses_the_workspace_logs_a_warning(recorded, tmp_path, caplog):
     with caplog.at_level("WARNING", logger="lerobot_symview.datasets.add_views"):
         add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
-    assert re.search(r"'side' sees \d+% of the workspace, .*: views will be empty outside its image", caplog.text)
+    assert re.search(r"'side' sees \d+ % of the workspace: views will be empty outside its image", caplog.text)
 
 
 @pytest.mark.long

@@ -1,0 +1,108 @@
+"""Checks of a dataset's calibration and depth unit against its images, before views are rendered."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+from lerobot_symview import keys
+from lerobot_symview.calibration.table_plane import TablePlane, check_table, has_depth, likely_depth_unit
+from lerobot_symview.datasets.features import declared_unit
+from lerobot_symview.datasets.source import EpisodeTables, FrameReader
+from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.units import METRES, unit_name
+from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
+from lerobot_symview.views import Frame
+
+logger = logging.getLogger(__name__)
+
+EPISODES = 3  # first, middle and last
+
+
+def with_depth_unit(reader: FrameReader, depth_unit: float | None) -> FrameReader:
+    """Return the reader with the unit of its camera's depth, metres per unit.
+
+    The unit is the argument, else the calibration file's, else the one that the dataset declares. Where none is stated,
+    it is the unit in which the first depth image shows the table at z = 0, which is logged; if the table is hidden, the
+    reader infers the unit from the values.
+    """
+    if not reader.depth:
+        return reader
+    key = keys.depth(reader.camera)
+    feature = reader.dataset.features[key]
+    unit = depth_unit or (reader.calibration.depth_units.get(reader.camera) if reader.calibration else None)
+    if unit is None and feature["dtype"] == "image" and declared_unit(feature) is None:
+        unit = _unit_by_table(reader, key)
+    return reader if unit is None else replace(reader, depth_unit=unit)
+
+
+def check_calibration(reader: FrameReader) -> TablePlane | None:
+    """Check camera and depth in the first frame of the first, middle and last episode.
+
+    Returns:
+        The table's plane in the first of these frames that shows it.
+
+    Raises:
+        CalibrationError: if a camera is below the table, shows the workspace in too few pixels or, with a fixed
+            calibration, sees too little of it, or if depth shows the table elsewhere than at z = 0.
+        DatasetError: if no frame has a valid depth pixel in the workspace.
+    """
+    frames = _first_frames(reader)
+    for episode, frame in frames.items():
+        minimum = MINIMUM_VISIBLE if reader.calibration is not None else 0.0
+        try:
+            check_camera(reader.camera, frame.camera, reader.workspace, minimum=minimum)
+        except CalibrationError as error:
+            raise CalibrationError(f"episode {episode}: {error}") from None
+    visible = min(reader.workspace.visible_fraction(frame.camera) for frame in frames.values())
+    if visible < MINIMUM_VISIBLE:
+        logger.warning(
+            "camera %r sees %.0f %% of the workspace: views will be empty outside its image",
+            reader.camera,
+            100 * visible,
+        )
+    return _check_tables(reader, frames) if reader.depth else None
+
+
+def _check_tables(reader: FrameReader, frames: dict[int, Frame]) -> TablePlane | None:
+    key = keys.depth(reader.camera)
+    is_video = reader.dataset.features[key]["dtype"] == "video"
+    unit = METRES if is_video else reader.depth_unit or reader.dataset.depth_unit(key)
+    planes = []
+    for episode, frame in frames.items():
+        if frame.depth is None or not has_depth(frame.depth, frame.camera, frame.workspace):
+            continue
+        try:
+            planes.append(check_table(frame.depth, frame.camera, frame.workspace, unit))
+        except CalibrationError as error:
+            raise CalibrationError(f"episode {episode}, {key}: {error}") from None
+    if not planes:
+        raise DatasetError(f"{key} has no valid pixel in the workspace, in the first frame of episodes {[*frames]}")
+    visible = [plane for plane in planes if plane is not None]
+    for plane in visible[:1]:
+        if plane.deviates:
+            logger.warning("%s: %s; check the calibration", key, plane)
+    return visible[0] if visible else None
+
+
+def _first_frames(reader: FrameReader) -> dict[int, Frame]:
+    """Return episode -> its first frame, for up to three episodes."""
+    count = len(reader.dataset.episodes)
+    return {episode: _frame(reader, episode, 0) for episode in sorted({0, count // 2, count - 1})[:EPISODES]}
+
+
+def _frame(reader: FrameReader, episode: int, index: int) -> Frame:
+    table = EpisodeTables(reader.dataset, reader.dataset.data_file(episode), reader.columns()).read(episode)
+    return next(reader.frames(episode, table.slice(index, 1)))
+
+
+def _unit_by_table(reader: FrameReader, key: str) -> float | None:
+    stored = reader.dataset.first_depth(key)
+    if stored is None:
+        return None
+    index, depth = stored
+    camera = _frame(replace(reader, views=()), 0, index).camera
+    unit = likely_depth_unit(depth, camera, reader.workspace)
+    if unit is not None:
+        logger.info("%s declares no depth_unit: the table at z = 0 shows %s", key, unit_name(unit))
+    return unit

@@ -1,0 +1,120 @@
+"""Whether a camera sees the workspace, and which other reading of its pose would explain that it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Array, Camera, invert_rigid, project
+from lerobot_symview.geometry.workspace import Workspace
+
+MINIMUM_VISIBLE = 0.6  # fraction of the working volume
+MINIMUM_PIXELS = 8.0  # side of the workspace in the image, as of the smallest view
+BELOW_TABLE = (
+    "usual causes are board corners in the wrong order (OpenCV orders them clockwise, seen from above: exchange x and "
+    "y) and a pose that is the inverse, cam_from_world"
+)
+# What people pass in place of world_from_cam. The matrices are theirs_from_opencv.
+AXES = {
+    "": np.eye(3),
+    "OpenGL axes (y up, z backward)": np.diag([1.0, -1.0, -1.0]),
+    "ROS link axes (x forward, z up)": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+}
+DIRECTIONS = {"": False, "the direction cam_from_world": True}
+UNITS = {"": 1.0, "a position in millimetres": 1e-3, "a position in centimetres": 1e-2, "a position in metres": 1e3}
+
+
+def check_above_table(camera: Camera) -> None:
+    """Raise a CalibrationError if a camera is not above the table's plane, z = 0: its views would be reflected."""
+    if not camera.world_from_cam[2, 3] > 0:
+        raise CalibrationError(f"the camera is below the table, at z = {camera.position[2]:.3g} m: {BELOW_TABLE}")
+
+
+def check_camera(
+    name: str, camera: Camera, workspace: Workspace, remedy: str = "", minimum: float = MINIMUM_VISIBLE
+) -> None:
+    """Raise an error unless a camera above the table shows enough of the workspace in enough pixels.
+
+    Args:
+        name: the camera's name in the message.
+        camera: the calibrated camera.
+        workspace: the working volume.
+        remedy: end of the message; by default the other readings of the pose with which the camera would be sound.
+        minimum: fraction of the working volume that must be in the image.
+
+    Raises:
+        CalibrationError: if the camera is below the table, sees too little of the workspace, or is too far away.
+    """
+    problem = camera_problem(camera, workspace, minimum)
+    if problem is not None:
+        raise CalibrationError(f"camera {name!r} {problem}: {remedy or _causes(camera, workspace, minimum)}")
+
+
+def _causes(camera: Camera, workspace: Workspace, minimum: float) -> str:
+    readings = sound_readings(camera, workspace, minimum)
+    causes = [BELOW_TABLE] if camera.position[2] <= 0 else ["check its pose and the workspace"]
+    causes += ["it would see the workspace with " + " or with ".join(readings)] if readings else []
+    return "; ".join(causes)
+
+
+def camera_problem(camera: Camera, workspace: Workspace, minimum: float = MINIMUM_VISIBLE) -> str | None:
+    """Return what is wrong with a camera's view of the workspace; None if nothing is."""
+    if not camera.position[2] > 0:
+        return f"is below the table, at z = {camera.position[2]:.3g} m"
+    visible = workspace.visible_fraction(camera)
+    if visible < minimum:
+        return f"sees {visible:.0%} of the workspace, expected at least {minimum:.0%}"
+    pixels = workspace_pixels(camera, workspace)
+    if pixels < MINIMUM_PIXELS:
+        return (
+            f"shows the workspace in {pixels:.2g} x {pixels:.2g} pixels, expected at least {MINIMUM_PIXELS:.0f}; "
+            f"it is {np.linalg.norm(camera.position - [*workspace.center, 0]):.3g} m away"
+        )
+    return None
+
+
+def workspace_pixels(camera: Camera, workspace: Workspace) -> float:
+    """Return the side, in pixels, of a square with the area of the workspace in the image.
+
+    It is infinite if a corner of the workspace is behind the camera.
+    """
+    corners, depth = project(workspace.corners(), camera)
+    if (depth <= 0).any():
+        return np.inf
+    following = np.roll(corners, -1, axis=0)
+    area = (corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]).sum() / 2
+    return float(np.sqrt(abs(area)))
+
+
+def read_differently(camera: Camera) -> dict[str, Camera]:
+    """Return description -> the camera with its pose read differently, the readings with fewest changes first."""
+    readings = {}
+    for (axes, theirs_from_opencv), (direction, inverse), (unit, metres) in product(
+        AXES.items(), DIRECTIONS.items(), UNITS.items()
+    ):
+        changes = [change for change in (direction, unit, axes) if change]
+        if changes:
+            pose = _scaled(camera.world_from_cam, metres)
+            pose = invert_rigid(pose) if inverse else pose
+            pose = pose.copy()
+            pose[:3, :3] = pose[:3, :3] @ theirs_from_opencv
+            readings[" and ".join(changes)] = (len(changes), replace(camera, world_from_cam=pose))
+    return {name: reading for name, (_, reading) in sorted(readings.items(), key=lambda item: item[1][0])}
+
+
+def sound_readings(camera: Camera, workspace: Workspace, minimum: float = MINIMUM_VISIBLE) -> list[str]:
+    """Return the descriptions of the simplest other readings of a pose with which the camera sees the workspace."""
+    sound = [
+        name for name, other in read_differently(camera).items() if camera_problem(other, workspace, minimum) is None
+    ]
+    fewest = min((name.count(" and ") for name in sound), default=0)
+    return [name for name in sound if name.count(" and ") == fewest]
+
+
+def _scaled(pose: Array, metres: float) -> Array:
+    scaled = pose.copy()
+    scaled[:3, 3] *= metres
+    return scaled
