@@ -15,6 +15,7 @@ from lerobot_symview.geometry.camera import Camera, project
 from lerobot_symview.geometry.workspace import Workspace
 
 TILE, GAP, LABEL = 228, 8, 24  # pixels
+LINE = 1.5  # pixels of a tile: width of an outline, whatever the size of the image
 OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)  # RGB of the workspace's border on the table and at its height limit
 BORDER_POINTS = 32  # per side of the workspace; segments that reach behind the camera are not drawn
 
@@ -70,6 +71,7 @@ def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -
     scale = max(1, round(2 * TILE / max(rgb.shape[:2])))
     image = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
     draw = ImageDraw.Draw(image)
+    width = max(2, round(LINE * max(image.size) / TILE))
     for height, color in ((workspace.height_limit, CEILING), (0.0, OUTLINE)):
         corners = workspace.corners(height)
         share = np.linspace(0, 1, BORDER_POINTS)[:, None]
@@ -78,7 +80,7 @@ def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -
         points = [tuple(point) for point in (pixels + 0.5) * scale]
         for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
             if near > 0 and far > 0:
-                draw.line([first, second], fill=color, width=max(2, scale))
+                draw.line([first, second], fill=color, width=width)
     return np.asarray(image)
 
 
