@@ -70,7 +70,7 @@ ALLOWED_IMPORTS = {
     "lerobot_symview.keys": set(),
     "lerobot_symview.registry": set(),
     "lerobot_symview.geometry": {"errors"},
-    "lerobot_symview.views": {"geometry", "registry", "errors"},
+    "lerobot_symview.views": {"geometry", "registry", "errors", "keys"},
     "lerobot_symview.calibration": {"geometry", "errors"},
     "lerobot_symview.runtime": {"views", "registry", "errors"},
     "lerobot_symview.datasets": {"calibration", "runtime", "views", "geometry", "registry", "errors", "keys"},

@@ -43,6 +43,7 @@ METRES = {"m": 1.0, "mm": 0.001}
 REQUIRED = ("height", "width", "intrinsics")
 POSES = ("world_from_cam", "cam_from_world", "position")
 OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion")
+OFF_CENTER = 0.2  # of the image's side: distance of the principal point from the middle
 ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
 UNDISTORT = (
     "lens distortion is not supported: undistort the images when recording, "
@@ -182,7 +183,24 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
         if not isinstance(entries[side], int) or entries[side] < 1:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
+    _warn_of_resized(name, intrinsics, entries["height"], entries["width"])
     return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
+
+
+def _warn_of_resized(name: str, intrinsics: Array, height: int, width: int) -> None:
+    """Warn of a principal point far from the middle: K is often that of another image size, or never calibrated."""
+    for value, size in ((intrinsics[0, 2], width), (intrinsics[1, 2], height)):
+        if 0 <= value < size and abs(value - size / 2) > OFF_CENTER * size:
+            logger.warning(
+                "camera %r: the principal point (%.4g, %.4g) is far from the middle of the %d x %d image: "
+                "are the intrinsics those of another image size?",
+                name,
+                intrinsics[0, 2],
+                intrinsics[1, 2],
+                width,
+                height,
+            )
+            return
 
 
 def _intrinsics(value: Any) -> Array:

@@ -79,10 +79,12 @@ def _check_tables(reader: FrameReader, frames: dict[int, Frame]) -> TablePlane |
     if not planes:
         raise DatasetError(f"{key} has no valid pixel in the workspace, in the first frame of episodes {[*frames]}")
     visible = [plane for plane in planes if plane is not None]
-    for plane in visible[:1]:
-        if plane.deviates:
-            logger.warning("%s: %s; check the calibration", key, plane)
-    return visible[0] if visible else None
+    if not visible:
+        logger.warning("%s does not show the table: its unit and the camera's pose are not checked", key)
+        return None
+    if visible[0].deviates:
+        logger.warning("%s: %s; check the calibration", key, visible[0])
+    return visible[0]
 
 
 def _first_frames(reader: FrameReader) -> dict[int, Frame]:

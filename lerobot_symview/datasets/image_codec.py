@@ -67,11 +67,13 @@ def decode_depth(data: Buffer) -> NDArray:
     """Decode a depth image to (H, W), float32 or uint16 as encoded.
 
     Raises:
-        ValueError: if `data` is not a one-channel image.
+        ValueError: if `data` is not a one-channel image of at least 16 bits.
     """
     image = _decode(data, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2:
-        raise ValueError(f"a depth image must have one channel, got shape {image.shape}")
+    if image.ndim != 2 or image.dtype.itemsize < 2:
+        raise ValueError(
+            f"a depth image must have one channel of 16 or 32 bits, got shape {image.shape} of {image.dtype}"
+        )
     return image
 
 

@@ -17,12 +17,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import Registry
 
 SMALLEST, LARGEST = 8, 4096  # rows and columns of a view
+# No table robot exceeds these; millimetres, degrees and percent do. A continuous yaw may have turned a few times.
+STATE_LIMITS = (10.0, 10.0, 10.0, 40.0, 2.0)
+METRES_FROM_CENTER = "metres relative to the workspace's centre"
+STATE_UNITS = (METRES_FROM_CENTER, METRES_FROM_CENTER, "metres above the table", "radians", "a fraction from 0 to 1")
 Kind = Literal["rgb", "height"]
 
 
@@ -69,9 +74,18 @@ class Frame:
 
 
 def check_gripper(state: list[float]) -> None:
-    """Raise a ValueError if a gripper state is not finite, since it would clip all points or none."""
+    """Raise a ValueError if a gripper's state cannot be in metres, radians and [0, 1].
+
+    Points would be clipped at a wrong height, and the gripper image would be empty.
+
+    Args:
+        state: x, y, z, yaw, aperture.
+    """
     if not all(map(math.isfinite, state)):
         raise ValueError(f"the gripper's x, y, z, yaw and aperture must be finite, got {state}")
+    for value, limit, name, expected in zip(state, STATE_LIMITS, keys.STATE_NAMES, STATE_UNITS, strict=True):
+        if abs(value) > limit:
+            raise ValueError(f"the gripper's {name} is {value:g}, expected {expected}")
 
 
 class View(ABC):

@@ -12,6 +12,7 @@ from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, plain_calibration
 from lerobot_symview.datasets.add_views import add_views
+from lerobot_symview.datasets.image_codec import decode_depth
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import invert_rigid
 from lerobot_symview.runtime.cli import DatasetLocation
@@ -150,6 +151,32 @@ def test_a_recording_without_depth_is_an_error(tmp_path):
     record_real_robot(tmp_path / "source", RGB, np.zeros_like(DEPTHS["mm"]))
     with pytest.raises(DatasetError, match=r"front_depth has no valid pixel in the workspace"):
         with_views(tmp_path / "source", tmp_path, calibration())
+
+
+def test_a_table_that_the_robot_hides_is_a_warning(tmp_path, caplog):
+    depth = plane_depth(CAMERA)
+    depth[20:] = 0.3
+    record_real_robot(tmp_path / "source", RGB, in_mm(depth))
+    with_views(tmp_path / "source", tmp_path, calibration())
+    assert "front_depth does not show the table: its unit and the camera's pose are not checked" in caplog.text
+
+
+def test_eight_bits_are_no_depth():
+    import cv2
+
+    png = bytes(cv2.imencode(".png", np.full((4, 4), 200, np.uint8))[1])
+    with pytest.raises(ValueError, match="one channel of 16 or 32 bits, got shape .* of uint8"):
+        decode_depth(png)
+
+
+def test_intrinsics_of_another_image_size_are_a_warning(caplog):
+    k = CAMERA.intrinsics.copy()
+    k[:2] /= 2
+    parse_calibration(calibration(intrinsics=k.tolist()))
+    assert "are the intrinsics those of another image size?" in caplog.text
+    caplog.clear()
+    parse_calibration(calibration())
+    assert not caplog.messages
 
 
 def test_depth_of_another_size_names_both_keys_and_the_remedy(tmp_path):

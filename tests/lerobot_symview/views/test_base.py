@@ -105,6 +105,10 @@ def test_invalid_depth_gives_an_empty_view(bad):
         ({"depth": np.zeros((96, 96), bool)}, "depth must be .*float metres.*bool"),
         ({"gripper": np.array([0.0, 0.0, np.nan, 0.0, 1.0])}, "gripper.*must be finite, got .*nan"),
         ({"gripper": np.array([0.0, 0.0, 0.2, 0.0, np.inf])}, "gripper.*must be finite, got .*inf"),
+        ({"gripper": np.array([450.0, 0.0, 200.0, 0.0, 1.0])}, "gripper's x is 450, expected metres relative to the w"),
+        ({"gripper": np.array([0.0, 0.0, 200.0, 0.0, 1.0])}, "gripper's z is 200, expected metres above the table"),
+        ({"gripper": np.array([0.0, 0.0, 0.2, 90.0, 1.0])}, "gripper's yaw is 90, expected radians"),
+        ({"gripper": np.array([0.0, 0.0, 0.2, 0.0, 57.0])}, "gripper's aperture is 57, expected a fraction from 0 to"),
     ],
 )
 def test_frames_with_wrong_shapes_dtypes_or_gripper_states_are_rejected(wrong, message):
