@@ -165,7 +165,7 @@ def test_eight_bits_are_no_depth():
     import cv2
 
     png = bytes(cv2.imencode(".png", np.full((4, 4), 200, np.uint8))[1])
-    with pytest.raises(ValueError, match="one channel of 16 or 32 bits, got shape .* of uint8"):
+    with pytest.raises(ValueError, match=r"one channel of 16 or 32 bits, got shape .* of uint8"):
         decode_depth(png)
 
 
