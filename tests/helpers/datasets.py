@@ -1,4 +1,4 @@
-"""Configurations of `add_views`, contents of folders, and modified datasets."""
+"""Configurations of `add_views`, contents of folders, and recorded and modified datasets."""
 
 import json
 
@@ -7,10 +7,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_depth, encode_metres
 from tests.conftest import VIEW_SIZE
+from tests.helpers.cameras import plane_depth
 
 
 def views_config(source, target, **options):
@@ -25,6 +27,40 @@ def contents(folder):
 def images_of(folder, key):
     dataset = LeRobotDataset("test/images", root=folder, depth_output_unit="m", video_backend="pyav")
     return np.stack([dataset[i][key].numpy() for i in range(len(dataset))])
+
+
+def record_real_robot(folder, camera, rgb, use_videos=False, episodes=1):
+    """Record episodes of three frames with joint angles and RealSense depth in uint16 millimetres; return the depth."""
+    size = (camera.height, camera.width)
+    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
+    kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
+    source = LeRobotDataset.create(
+        "test/real",
+        fps=10,
+        root=folder,
+        use_videos=use_videos,
+        features={
+            keys.STATE: joints,
+            keys.ACTION: joints,
+            keys.rgb("front"): {"dtype": kind, "shape": (*size, 3), "names": axes},
+            keys.depth("front"): {
+                "dtype": "image",
+                "shape": (*size, 1),
+                "names": axes,
+                "info": {"is_depth_map": True},
+            },
+        },
+    )
+    depth = np.rint(1000 * plane_depth(camera, height=0.02)).astype(np.uint16)[..., None]
+    rng = np.random.default_rng(0)
+    for _ in range(episodes):
+        for _ in range(3):
+            angles = rng.normal(size=6).astype(np.float32)
+            frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
+            source.add_frame(frame | {"task": "none"})
+        source.save_episode()
+    source.finalize()
+    return depth
 
 
 def change_feature(folder, key, **entries):

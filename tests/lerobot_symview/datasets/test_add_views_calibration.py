@@ -24,6 +24,7 @@ from lerobot_symview.calibration.file import (
 )
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.features import camera_features
+from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
 from lerobot_symview.datasets.source import vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose, stored_camera
@@ -35,7 +36,7 @@ from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.conftest import VIEW_SIZE
 from tests.helpers.cameras import plane_depth
-from tests.helpers.datasets import images_of, views_config
+from tests.helpers.datasets import images_of, record_real_robot, views_config
 
 NO_GRIPPER = make_view("persp", size=VIEW_SIZE, gripper=False)
 
@@ -96,7 +97,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         fps=10,
         root=tmp_path / "wrist",
         use_videos=False,
-        features=camera_features("wrist", 48, 64, {})
+        features=camera_features("wrist", 48, 64, Workspace())
         | {keys.ACTION: {"dtype": "float32", "shape": (1,), "names": None}},
     )
     rng, expected = np.random.default_rng(0), []
@@ -125,39 +126,6 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         assert index == 0 or (colors[index] != colors[index - 1]).any()
 
 
-def record_real_robot(folder, camera, rgb, use_videos=False):
-    """Record three frames with joint angles and RealSense depth in uint16 millimetres; return the depth."""
-    size = (camera.height, camera.width)
-    joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
-    kind, axes = "video" if use_videos else "image", ["height", "width", "channels"]
-    source = LeRobotDataset.create(
-        "test/real",
-        fps=10,
-        root=folder,
-        use_videos=use_videos,
-        features={
-            keys.STATE: joints,
-            keys.ACTION: joints,
-            keys.rgb("front"): {"dtype": kind, "shape": (*size, 3), "names": axes},
-            keys.depth("front"): {
-                "dtype": "image",
-                "shape": (*size, 1),
-                "names": axes,
-                "info": {"is_depth_map": True},
-            },
-        },
-    )
-    depth = np.rint(1000 * plane_depth(camera, height=0.02)).astype(np.uint16)[..., None]
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        angles = rng.normal(size=6).astype(np.float32)
-        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth, keys.STATE: angles, keys.ACTION: angles}
-        source.add_frame(frame | {"task": "none"})
-    source.save_episode()
-    source.finalize()
-    return depth
-
-
 @pytest.mark.parametrize("use_videos", [False, True])
 def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos):
     camera = Camera(intrinsics_from_fov(0.8, 96, 128), orbit_pose(0.9, 0.4, 0.8, (0.45, 0.0, 0.0)), 96, 128)
@@ -175,9 +143,10 @@ def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos
     for name in ("reproj", "persp"):
         color = images_of(result, keys.view("front", name)) * 255
         assert np.abs(color - np.reshape([200, 100, 50], (1, 3, 1, 1))).max() <= (4 if use_videos else 0.01)
-    facts = json.loads((result / "meta" / "info.json").read_text())["features"][keys.view("front", "reproj")]["info"]
-    assert facts["symview"]["workspace"]["size"] == 0.3
-    assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
+    info = json.loads((result / "meta" / "info.json").read_text())
+    assert info["features"][keys.view("front", "reproj")]["info"]["symview"]["workspace"]["size"] == 0.3
+    made_with = read_settings(result, ADDED_VIEWS)
+    assert parse_calibration(made_with["calibration"]).camera("front").height == 96
 
 
 def test_views_are_bit_identical_offline_online_and_from_stored_matrices(tmp_path):
