@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from tqdm import tqdm
 from lerobot_symview import keys
 from lerobot_symview.datasets.features import Features, camera_features
 from lerobot_symview.datasets.hub import push_dataset
+from lerobot_symview.datasets.metadata import RECORDING
 from lerobot_symview.geometry.camera import project
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import run_command
@@ -21,7 +21,6 @@ from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, remove_partial
 from symview_sim.env import SymviewEnv
 from symview_sim.recording import (
-    MADE_FROM,
     MAX_VIDEO_DEPTH,
     Recording,
     join_shards,
@@ -98,7 +97,7 @@ def generate(config: GenerateConfig) -> Path:
 def _write(config: GenerateConfig) -> Path:
     target = config.dataset.folder()
     recording = plan_recording(config, target)
-    if is_complete(target, MADE_FROM, recording.description(), config.resume, "--dataset.root"):
+    if is_complete(target, RECORDING, recording.description(), config.resume, "--dataset.root"):
         logger.info("%s is already complete", target)
         return target
     begin_recording(recording, config.resume)
@@ -172,15 +171,6 @@ def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:
 
 
 def _features(env: SymviewEnv, config: GenerateConfig) -> Features:
-    facts = {
-        "workspace": asdict(env.workspace),
-        "task": config.env.task,
-        "robot": config.env.robot,
-        "seed": config.seed,
-        "noise": config.noise,
-        "pybullet": version("pybullet"),
-        "symview": version("lerobot_policy_symview"),
-    }
     features: Features = {
         keys.STATE: {"dtype": "float32", "shape": (len(keys.STATE_NAMES),), "names": keys.STATE_NAMES},
         keys.ACTION: {"dtype": "float32", "shape": (len(keys.ACTION_NAMES),), "names": keys.ACTION_NAMES},
@@ -190,8 +180,7 @@ def _features(env: SymviewEnv, config: GenerateConfig) -> Features:
     }
     for spec in env.specs:
         shown = {"depth": config.env.depth, "segmentation": config.env.segmentation}
-        placement = facts | {"placement": asdict(spec)}
-        features |= camera_features(spec.name, spec.height, spec.width, placement, **shown)
+        features |= camera_features(spec.name, spec.height, spec.width, env.workspace, **shown)
     if config.video:
         for key, feature in features.items():
             if feature["dtype"] == "image" and not (config.env.oracle and key == keys.depth("top")):

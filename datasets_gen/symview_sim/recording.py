@@ -18,6 +18,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -25,13 +26,14 @@ from unittest.mock import patch
 import numpy as np
 
 from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.metadata import RECORDING
 from lerobot_symview.runtime.staging import disk_errors, part_of, plain
 from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import EnvSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
 ATTEMPTS_KEY = "attempts"
-MADE_FROM = "symview_recording.json"  # in the finished dataset's `meta`
+ROBOT_TYPE = "symview"  # of every arm: states and actions are the gripper's, so recordings of different arms merge
 # With its default block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images despite `lossless`.
 LOSSLESS = "lossless=1:ctu=16:bframes=0"
 MAX_VIDEO_DEPTH = 1.6  # metres: with 12 bits, steps of 0.39 mm and errors of at most 0.2 mm
@@ -70,7 +72,8 @@ class Recording:
         """Return everything that determines the data, as JSON values."""
         content = asdict(self)
         del content["folder"]
-        return plain(content)
+        versions = {"symview": version("lerobot_policy_symview"), "pybullet": version("pybullet")}
+        return plain(content | versions)
 
 
 def record_episode(recording: Recording, episode: int) -> int:
@@ -140,8 +143,10 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
                     concatenate_data=False,
                     concatenate_videos=False,
                 )
-        _complete_metadata(joined, len(attempts) / sum(attempts.values()))
-        (joined / "meta" / MADE_FROM).write_text(json.dumps(recording.description(), indent=4))
+        stats = joined / "meta" / "stats.json"
+        stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))  # the order varies
+        content = recording.description() | {"expert_success_rate": len(attempts) / sum(attempts.values())}
+        (joined / "meta" / RECORDING).write_text(json.dumps(content, indent=4))
     return joined
 
 
@@ -168,7 +173,7 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
         fps=recording.fps,
         features={key: dict(feature) for key, feature in recording.features.items()},
         root=root,
-        robot_type=recording.env.robot,
+        robot_type=ROBOT_TYPE,
         use_videos=recording.video,
         **(encoders if recording.video else {}),
     )
@@ -179,18 +184,6 @@ def _frames(file: Path) -> Iterator[EpisodeFrames]:
         episode = {key: content[key] for key in content.files if key != ATTEMPTS_KEY}
     for index in range(len(next(iter(episode.values())))):
         yield {key: values[index] for key, values in episode.items()}
-
-
-def _complete_metadata(dataset: Path, success_rate: float) -> None:
-    """Add the expert's success rate to each camera's metadata, and sort the statistics, whose order varies."""
-    info, stats = dataset / "meta" / "info.json", dataset / "meta" / "stats.json"
-    content = json.loads(info.read_text())
-    for feature in content["features"].values():
-        facts = (feature.get("info") or {}).get("symview")
-        if facts is not None:
-            facts["expert_success_rate"] = success_rate
-    info.write_text(json.dumps(content, indent=4))
-    stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))
 
 
 @contextmanager

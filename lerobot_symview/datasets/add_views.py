@@ -15,7 +15,6 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.derivation import (
-    MADE_FROM,
     Derivation,
     cut_parts,
     derived_schema,
@@ -25,6 +24,7 @@ from lerobot_symview.datasets.derivation import (
 )
 from lerobot_symview.datasets.features import Features, calibration_features, stored_workspace, view_features
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
+from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, gripper_dimensions
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.visibility import check_camera
@@ -137,7 +137,7 @@ def _write(config: AddViewsConfig) -> Path:
     with EXECUTORS["local"](config.num_workers, "lerobot_symview.datasets.derivation") as executor:
         derivation = _plan(config, source, partial_folder(target))
         description = _description(config, derivation)
-        if is_complete(target, MADE_FROM, description, config.resume, "--new_root"):
+        if is_complete(target, ADDED_VIEWS, description, config.resume, "--new_root"):
             logger.info("%s is already complete", target)
             return target
         _check_first_frame(derivation, source)
@@ -172,9 +172,8 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         with flagged(f"--calibration={config.calibration}"):
             check_camera(config.camera, calibration.camera(config.camera), workspace)
         added |= calibration_features(config.camera)
-    stored_calibration = plain_calibration(calibration) if calibration is not None else None
     for name, view in views.items():
-        added |= view_features(config.camera, name, view, workspace, stored_calibration)
+        added |= view_features(config.camera, name, view, workspace)
     kept = config.kept_images()
     dropped = [
         key

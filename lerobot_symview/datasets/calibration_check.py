@@ -11,7 +11,7 @@ from lerobot_symview.datasets.features import declared_unit
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.units import METRES, unit_name
-from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
+from lerobot_symview.geometry.visibility import LEAST_VISIBLE, MINIMUM_VISIBLE, check_camera
 from lerobot_symview.views import Frame
 
 logger = logging.getLogger(__name__)
@@ -43,13 +43,13 @@ def check_calibration(reader: FrameReader) -> TablePlane | None:
         The table's plane in the first of these frames that shows it.
 
     Raises:
-        CalibrationError: if a camera is below the table, shows the workspace in too few pixels or, with a fixed
-            calibration, sees too little of it, or if depth shows the table elsewhere than at z = 0.
+        CalibrationError: if a camera is below the table, shows the workspace in too few pixels, sees less than 10 % of
+            it, or 60 % with a fixed calibration, or if depth shows the table elsewhere than at z = 0.
         DatasetError: if no frame has a valid depth pixel in the workspace.
     """
     frames = _first_frames(reader)
     for episode, frame in frames.items():
-        minimum = MINIMUM_VISIBLE if reader.calibration is not None else 0.0
+        minimum = MINIMUM_VISIBLE if reader.calibration is not None else LEAST_VISIBLE
         try:
             check_camera(reader.camera, frame.camera, reader.workspace, minimum=minimum)
         except CalibrationError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
+from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, is_depth_feature
 
 CARD, IMAGE = "README.md", "meta/symview_image.png"
 SHOWN_FRAME = 2  # index in the first episode: the arm is in the image and the gripper moves
+SHOWN_TASKS = 5  # instructions that are listed
 HEIGHT = 228  # rows of the card's image
 TAGS = ("LeRobot", "symview", "robotics", "equivariance")
 REPOSITORY = "lerobot_symview"
@@ -32,16 +33,21 @@ def write_card(folder: Path, repo_id: str, tags: list[str]) -> None:
 def dataset_card(dataset: SourceDataset, repo_id: str, tags: list[str], has_image: bool) -> str:
     """Return the card: YAML metadata for the Hub, then Markdown."""
     info = dataset.info
-    facts = _facts(dataset)
-    title = facts.get("task", repo_id.split("/")[1]).replace("_", " ")
+    recording = read_settings(dataset.folder, RECORDING)
+    title = recording["env"]["task"] if recording else repo_id.split("/")[1]
+    placements = _placements(recording)
     sections = [
         _metadata([*TAGS, *tags]),
-        f"# {title.capitalize()}, recorded by freely placed cameras\n",
+        f"# {title.replace('_', ' ').capitalize()}, recorded by freely placed cameras\n",
         f"{info['total_episodes']} episodes, {info['total_frames']} frames at {info['fps']} Hz, LeRobot format "
-        f"{info['codebase_version']}.{_recorded(facts)}\n",
+        f"{info['codebase_version']}.{_recorded(recording)}{_instructions(dataset)}\n",
         f"![Images of one frame]({IMAGE})\n" if has_image else "",
         "## Images\n\n| key | pixels | content |\n|---|---|---|",
-        *(_image_row(key, feature) for key, feature in dataset.features.items() if _is_image(feature)),
+        *(
+            _image_row(key, feature, placements.get(key))
+            for key, feature in dataset.features.items()
+            if _is_image(feature)
+        ),
         _calibration(dataset),
         "\n## State and action\n",
         _dimensions(dataset, keys.STATE),
@@ -64,52 +70,53 @@ def _metadata(tags: list[str]) -> str:
     return f"---\n{data.to_yaml()}\n---\n"
 
 
-def _facts(dataset: SourceDataset) -> dict[str, Any]:
-    """Return the task, robot and other settings of the recording, as stored with its images and in its metadata."""
-    facts: dict[str, Any] = {}
-    for feature in dataset.features.values():
-        facts |= (feature.get("info") or {}).get("symview", {})
-    recording = dataset.folder / "meta" / "symview_recording.json"
-    if recording.is_file():
-        request = json.loads(recording.read_text())
-        facts |= {"task": request["env"]["task"], "robot": request["env"]["robot"], "seed": request["seed"]}
-        facts |= {"instruction": request["instruction"], "noise": request["noise"]}
-    return facts
-
-
-def _recorded(facts: dict[str, Any]) -> str:
-    if "task" not in facts:
+def _recorded(recording: dict[str, Any]) -> str:
+    if not recording:
         return ""
+    env = recording["env"]
     sentences = [
-        f"A scripted expert performs `{facts['task']}` with a {facts['robot']} arm in PyBullet, seed {facts['seed']}."
+        f"A scripted expert performs `{env['task']}` with a {env['robot']} arm in PyBullet, seed {recording['seed']}."
     ]
-    if "instruction" in facts:
-        sentences.append(f'The instruction is "{facts["instruction"]}"')
-    if facts.get("noise"):
-        deviation = f"a standard deviation of {facts['noise']:g} of the largest action"
+    if recording["noise"]:
+        deviation = f"a standard deviation of {recording['noise']:g} of the largest action"
         sentences.append(f"Noise with {deviation} is added to its actions; the recorded actions are without noise.")
-    if "expert_success_rate" in facts:
-        rate = f"{100 * facts['expert_success_rate']:.1f} %"
+    if "expert_success_rate" in recording:
+        rate = f"{100 * recording['expert_success_rate']:.1f} %"
         sentences.append(f"It succeeded in {rate} of its attempts; the dataset holds the successful ones only.")
     return " " + " ".join(sentences)
 
 
-def _image_row(key: str, feature: dict[str, Any]) -> str:
+def _instructions(dataset: SourceDataset) -> str:
+    instructions = sorted({task for row in dataset.episodes for task in row.get("tasks") or []})
+    if not instructions:
+        return ""
+    more = f" and {len(instructions) - SHOWN_TASKS} more" if len(instructions) > SHOWN_TASKS else ""
+    return f" Instructions: {', '.join(f'"{text}"' for text in instructions[:SHOWN_TASKS])}{more}."
+
+
+def _placements(recording: dict[str, Any]) -> dict[str, Any]:
+    """Return the placement of the camera that recorded each image, by feature key."""
+    if not recording:
+        return {}
+    specs = [recording["env"]["camera"], *recording["env"]["more_cameras"]]
+    return {key(spec["name"]): spec for spec in specs for key in (keys.rgb, keys.depth, keys.segmentation)}
+
+
+def _image_row(key: str, feature: dict[str, Any], placement: dict[str, Any] | None) -> str:
     height, width, _ = feature["shape"]
-    symview = (feature.get("info") or {}).get("symview", {})
+    meaning = (feature.get("info") or {}).get("symview", {})
     unit = (feature.get("info") or {}).get("depth_unit")
-    if "view" in symview:
-        options = ", ".join(f"{name}={value}" for name, value in symview["options"].items())
-        text = f"view `{symview['view']}` made from camera `{symview['camera']}` ({options})"
-    elif "placement" in symview:
-        placement = symview["placement"]
+    if "view" in meaning:
+        options = ", ".join(f"{name}={value}" for name, value in meaning["options"].items())
+        text = f"view `{meaning['view']}` made from camera `{meaning['camera']}` ({options})"
+    elif placement is not None:
         angle, distance = f"{placement['elevation_deg']:g} degrees", f"{placement['distance']:g} m"
         text = f"camera `{placement['name']}`, {angle} above the table, {distance} away"
         if any(placement["spread"].values()):
             text += ", randomised in every episode"
     else:
         text = "camera"
-    measure = f", {'height' if 'view' in symview else 'depth'} in {unit}" if unit else ""
+    measure = f", {'height' if 'view' in meaning else 'depth'} in {unit}" if unit else ""
     return f"| `{key}` | {height} x {width} | {text}{measure} |"
 
 

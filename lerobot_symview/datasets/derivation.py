@@ -28,13 +28,13 @@ from lerobot_symview.calibration.file import Calibration
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
 from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
+from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.staging import disk_errors, part_of
 from lerobot_symview.views import View
 
 PART_FRAMES = 200  # least frames of a part, unless its source file has fewer
-MADE_FROM = "symview_views.json"  # file in the result's `meta` with its settings
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
         stats = json.loads((meta / "stats.json").read_text())
         stats = {key: value for key, value in stats.items() if key not in derivation.dropped} | totals
         (meta / "stats.json").write_text(json.dumps(stats, indent=4, sort_keys=True))
-        (meta / MADE_FROM).write_text(json.dumps(description, indent=4))
+        (meta / ADDED_VIEWS).write_text(json.dumps(description, indent=4))
     return derivation.dataset
 
 

@@ -1,4 +1,8 @@
-"""LeRobot feature declarations of cameras and views."""
+"""LeRobot feature declarations of cameras and views.
+
+LeRobot merges only datasets whose declarations are equal, so `info["symview"]` holds what an image means, such as the
+workspace and a view's options, and nothing that may differ between recordings.
+"""
 
 from __future__ import annotations
 
@@ -18,27 +22,28 @@ Features = dict[str, dict[str, Any]]
 IMAGE_AXES = ["height", "width", "channels"]
 
 
-def color_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
-    """Declare a uint8 RGB image; `facts` are stored under `info["symview"]`."""
-    return {"dtype": "image", "shape": (height, width, 3), "names": IMAGE_AXES, "info": {"symview": facts}}
+def color_feature(height: int, width: int, meaning: dict[str, Any]) -> dict[str, Any]:
+    """Declare a uint8 RGB image; `meaning` is stored under `info["symview"]`."""
+    return {"dtype": "image", "shape": (height, width, 3), "names": IMAGE_AXES, "info": {"symview": meaning}}
 
 
-def metric_feature(height: int, width: int, facts: dict[str, Any]) -> dict[str, Any]:
-    """Declare a float32 image in metres, stored losslessly; `facts` are stored under `info["symview"]`."""
-    info = {"is_depth_map": True, "depth_unit": "m", "symview": facts}
+def metric_feature(height: int, width: int, meaning: dict[str, Any]) -> dict[str, Any]:
+    """Declare a float32 image in metres, stored losslessly; `meaning` is stored under `info["symview"]`."""
+    info = {"is_depth_map": True, "depth_unit": "m", "symview": meaning}
     return {"dtype": "image", "shape": (height, width, 1), "names": IMAGE_AXES, "info": info}
 
 
 def camera_features(
-    name: str, height: int, width: int, facts: dict[str, Any], *, depth: bool = True, segmentation: bool = False
+    name: str, height: int, width: int, workspace: Workspace, *, depth: bool = True, segmentation: bool = False
 ) -> Features:
     """Declare the colour image and calibration of one camera, and optionally its depth and segmentation."""
-    features = {keys.rgb(name): color_feature(height, width, facts)}
+    meaning = {"workspace": asdict(workspace)}
+    features = {keys.rgb(name): color_feature(height, width, meaning)}
     if depth:
-        features[keys.depth(name)] = metric_feature(height, width, facts)
+        features[keys.depth(name)] = metric_feature(height, width, meaning)
     if segmentation:
         labels = {"labels": {"0": "table", "1": "robot", "2 and up": "objects"}}
-        features[keys.segmentation(name)] = color_feature(height, width, facts | labels)
+        features[keys.segmentation(name)] = color_feature(height, width, meaning | labels)
     return features | calibration_features(name)
 
 
@@ -58,19 +63,12 @@ def calibration_features(name: str) -> Features:
     }
 
 
-def view_features(
-    camera: str, name: str, view: View, workspace: Workspace, calibration: dict[str, Any] | None = None
-) -> Features:
-    """Declare the outputs of `view`, with all parameters needed to render them again.
-
-    `calibration` is the content of a calibration file; None if the frames store the calibration.
-    """
-    facts = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
-    if calibration is not None:
-        facts["calibration"] = calibration
+def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:
+    """Declare the outputs of `view`; the camera's images and calibration and `info["symview"]` render them again."""
+    meaning = {"view": name, "camera": camera, "options": asdict(view), "workspace": asdict(workspace)}
     declare = {"rgb": color_feature, "height": metric_feature}
     return {
-        keys.view(camera, output): declare[kind](view.size, view.size, facts) for output, kind in view.outputs.items()
+        keys.view(camera, output): declare[kind](view.size, view.size, meaning) for output, kind in view.outputs.items()
     }
 
 
@@ -106,10 +104,10 @@ def stored_workspace(features: Features) -> Workspace:
     from lerobot_symview.calibration.file import parse_workspace
 
     for key, feature in features.items():
-        facts = (feature.get("info") or {}).get("symview", {})
-        if "workspace" in facts:
+        meaning = (feature.get("info") or {}).get("symview", {})
+        if "workspace" in meaning:
             try:
-                return parse_workspace(facts["workspace"])
+                return parse_workspace(meaning["workspace"])
             except CalibrationError as error:
                 raise CalibrationError(f"the workspace declared by {key}: {error}") from None
     return Workspace()

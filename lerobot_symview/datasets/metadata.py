@@ -1,4 +1,12 @@
-"""Reading and validation of a LeRobot dataset's `meta/info.json`: paths stay in the dataset, sizes are bounded."""
+"""Reading and validation of a dataset's metadata: paths stay in the dataset, sizes are bounded.
+
+    meta/info.json                  LeRobot's; a feature's `info["symview"]` says what its values mean
+    meta/symview_recording.json     settings of a simulated recording and its expert's success rate, optional
+    meta/symview_views.json         settings of `symview-add-views`, optional
+
+LeRobot merges only datasets whose features are equal. Hence the features hold nothing that may differ between
+recordings: the calibration is in columns, the rest in our own files, which LeRobot's tools do not copy.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +23,7 @@ MOST_PIXELS = 2**26  # largest size of an image
 COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # least values
 NUMBERS = r"\{(?:chunk|file)_index(?::0[1-9]d)?\}"
 TEMPLATES = {"data_path": NUMBERS, "video_path": rf"{NUMBERS}|\{{video_key\}}"}
+RECORDING, ADDED_VIEWS = "symview_recording.json", "symview_views.json"
 
 
 def read_info(folder: Path) -> dict[str, Any]:
@@ -26,12 +35,7 @@ def read_info(folder: Path) -> dict[str, Any]:
     file = folder / "meta" / "info.json"
     if not file.is_file():
         raise DatasetError(f"there is no LeRobot dataset in {folder}")
-    try:
-        info = json.loads(file.read_text())
-    except (ValueError, RecursionError) as error:
-        raise DatasetError(f"cannot read {file}: {error}") from None
-    if not isinstance(info, dict):
-        raise DatasetError(f"{file} must hold an object, got {type(info).__name__}")
+    info = _read_object(file)
     version = info.get("codebase_version")
     if version != FORMAT:
         raise DatasetError(f"the dataset at {folder} has format {version}, expected {FORMAT}: convert it with LeRobot")
@@ -39,6 +43,26 @@ def read_info(folder: Path) -> dict[str, Any]:
     if problems:
         raise DatasetError(f"{file}: {'; '.join(problems)}")
     return info
+
+
+def read_settings(folder: Path, name: str) -> dict[str, Any]:
+    """Return the content of a dataset's file `name`, `RECORDING` or `ADDED_VIEWS`; {} if the dataset lacks it.
+
+    Raises:
+        DatasetError: if the file is not a JSON object.
+    """
+    file = folder / "meta" / name
+    return _read_object(file) if file.is_file() else {}
+
+
+def _read_object(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text())
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"cannot read {file}: {error}") from None
+    if not isinstance(content, dict):
+        raise DatasetError(f"{file} must hold an object, got {type(content).__name__}")
+    return content
 
 
 def _problems(info: dict[str, Any]) -> Iterator[str]:
@@ -63,8 +87,8 @@ def _feature_problems(key: str, feature: Any) -> Iterator[str]:
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         yield "must be an object with a dtype"
         return
-    facts = feature.get("info") or {}
-    if not isinstance(facts, dict) or not isinstance(facts.get("symview", {}), dict):
+    info = feature.get("info") or {}
+    if not isinstance(info, dict) or not isinstance(info.get("symview", {}), dict):
         yield "has an info that is not an object"
     shape = feature.get("shape")
     if feature["dtype"] in ("image", "video") and (

@@ -12,6 +12,7 @@ from lerobot_symview.geometry.camera import Array, Camera, invert_rigid, project
 from lerobot_symview.geometry.workspace import Workspace
 
 MINIMUM_VISIBLE = 0.6  # fraction of the working volume
+LEAST_VISIBLE = 0.1  # a camera that sees less, fixed or moving, makes empty views
 MINIMUM_PIXELS = 8.0  # side of the workspace in the image, as of the smallest view
 BELOW_TABLE = (
     "usual causes are board corners in the wrong order (OpenCV orders them clockwise, seen from above: exchange x and "

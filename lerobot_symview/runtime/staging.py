@@ -39,7 +39,7 @@ def is_complete(target: Path, made_from: str, description: dict[str, Any], resum
 
     Args:
         target: folder of the result.
-        made_from: file in the `meta` folder of `target` that holds its description.
+        made_from: file in the `meta` folder of `target` that holds its description, and may hold more.
         description: settings of this run.
         resume: whether to accept an existing result.
         flag: command-line flag that sets `target`.
@@ -50,7 +50,7 @@ def is_complete(target: Path, made_from: str, description: dict[str, Any], resum
     if not target.exists():
         return False
     file = target / "meta" / made_from
-    if resume and file.exists() and json.loads(file.read_text()) == description:
+    if resume and file.exists() and description.items() <= json.loads(file.read_text()).items():
         folder = partial_folder(target)
         if (folder / DONE).exists() or _request(folder) == description:
             remove_partial(folder)

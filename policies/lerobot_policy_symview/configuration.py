@@ -88,7 +88,8 @@ class SymviewConfig(PreTrainedConfig):
     workspace: dict[str, Any] = field(default_factory=lambda: asdict(Workspace()))
     """Constructor arguments of `Workspace`; read from the dataset."""
     calibration: dict[str, Any] = field(default_factory=dict)
-    """Content of a calibration file, for observations without calibration; read from the dataset."""
+    """Content of a calibration file, for observations without calibration; read from a dataset whose camera never
+    moved."""
 
     # The policy scales states and actions itself, in a way that commutes with the group; per-axis statistics do not.
     normalization_mapping: dict[str, NormalizationMode] = field(

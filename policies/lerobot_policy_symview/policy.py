@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.encoders import make_encoder
+from lerobot_policy_symview.inputs.feature_contract import read_calibration
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
@@ -79,6 +80,7 @@ class SymviewPolicy(PreTrainedPolicy):
     def __init__(self, config: SymviewConfig, make_head: MakeHead, dataset_stats: dict[str, dict[str, Any]] | None):
         super().__init__(config)
         config.validate_features()
+        read_calibration(config)
         self.config: SymviewConfig = config
         self.workspace = parse_workspace(config.workspace)
         self.scene = make_scene_input(config, self.workspace)

@@ -28,7 +28,7 @@ from lerobot_symview.geometry.units import (
     unit_name,
     units_per_metre,
 )
-from lerobot_symview.geometry.visibility import check_camera
+from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
 from lerobot_symview.views import Frame, View, ViewSpec, make_views
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         default = calibration.workspace if calibration and not self.workspace else None
         self._workspace = default or parse_workspace(self.workspace)
         if self._fixed_camera is not None:
-            check_camera(self.camera, self._fixed_camera, self._workspace)
+            check_camera(self.camera, self._fixed_camera, self._workspace, minimum=LEAST_VISIBLE)
         calibrated = calibration.depth_units.get(self.camera) if calibration else None
         self._units = {} if calibrated is None else {keys.depth(self.camera): calibrated}
         self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
@@ -167,7 +167,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         from lerobot_symview.calibration.table_plane import check_table, has_depth
 
         camera = batch.cameras[0]
-        check_camera(self.camera, camera, self._workspace, minimum=0.0)
+        check_camera(self.camera, camera, self._workspace, minimum=LEAST_VISIBLE)
         if batch.depth is None:
             return
         key, depth = keys.depth(self.camera), batch.depth[0].cpu().numpy()

@@ -53,8 +53,8 @@ def in_mm(depth, unit=0.001):
     return np.rint(depth / unit).astype(np.uint16)
 
 
-def record_real_robot(folder, rgb, depth, use_videos=False, **depth_info):
-    """Record three frames of a robot with joint angles and an RGBD camera `front` without calibration."""
+def record_real_robot(folder, rgb, depth, use_videos=False, episodes=1, **depth_info):
+    """Record episodes of three frames of a robot with joint angles and an RGBD camera `front` without calibration."""
     joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
     axes = ["height", "width", "channels"]
     dataset = LeRobotDataset.create(
@@ -75,9 +75,10 @@ def record_real_robot(folder, rgb, depth, use_videos=False, **depth_info):
         },
     )
     rng = np.random.default_rng(0)
-    for _ in range(3):
-        angles = rng.normal(size=6).astype(np.float32)
-        frame = {keys.rgb("front"): rgb, keys.depth("front"): depth[..., None], keys.STATE: angles, keys.ACTION: angles}
-        dataset.add_frame(frame | {"task": "none"})
-    dataset.save_episode()
+    images = {keys.rgb("front"): rgb, keys.depth("front"): depth[..., None]}
+    for _ in range(episodes):
+        for _ in range(3):
+            angles = rng.normal(size=6).astype(np.float32)
+            dataset.add_frame(images | {keys.STATE: angles, keys.ACTION: angles, "task": "none"})
+        dataset.save_episode()
     dataset.finalize()

@@ -152,7 +152,6 @@ def test_huge_views_are_refused(view):
         {"options": "size"},
         {"workspace": {"size": float("nan")}},
         {"workspace": "here"},
-        {"calibration": {"cameras": "front"}},
     ],
 )
 def test_a_policy_refuses_invalid_view_options_of_a_dataset(with_views, facts):

@@ -1,21 +1,26 @@
-"""What a policy reads from a dataset's features: its inputs, the view's options, the workspace and the calibration."""
+"""What a policy reads from a dataset: inputs, view options, workspace, and the calibration of a fixed camera."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
+from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.views import View, ViewSpec
 
 Features = dict[str, dict[str, Any]]
 
 
 def read_features(config: SymviewConfig, features: Features) -> None:
-    """Set a configuration's inputs, outputs, view options, workspace and calibration from a dataset's features.
+    """Set a configuration's inputs, outputs, view options and workspace from a dataset's features.
 
     LeRobot accepts no visual feature at evaluation that was not declared in training, so the camera's raw images are
     declared even where training reads only views made from them.
@@ -59,11 +64,8 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
         try:
             config.view = ViewSpec(config.view.name, stored["symview"]["options"])
             config.workspace = dict(stored["symview"]["workspace"])
-            config.calibration = dict(stored["symview"].get("calibration", config.calibration))
             config.make_view()
             parse_workspace(config.workspace)
-            if config.calibration:
-                parse_calibration(config.calibration)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"the dataset does not say how {config.color_key} was made: {error}") from None
     else:
@@ -72,6 +74,56 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
         if config.is_computed and not set(keys.STATE_NAMES) <= set(config.state_symmetry):
             changed = _changed_options(config.make_view(), config.make_view().without_gripper())
             config.view = ViewSpec(config.view.name, config.view.options | changed)
+
+
+def read_calibration(config: SymviewConfig) -> None:
+    """Set a configuration's calibration to that of a camera that never moved in the training dataset.
+
+    It is for observations without calibration, such as a real robot's. If the camera moved, or the dataset lacks its
+    calibration, the configuration is unchanged.
+
+    Raises:
+        CalibrationError: if the calibration in the dataset is invalid.
+    """
+    meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
+    if meta is not None and (config.is_computed or config.sees_points or config.camera_direction):
+        camera = _fixed_camera(meta, config.camera)
+        if camera is not None:
+            recorded = _calibration_file(meta)
+            units = recorded.depth_units if recorded else {}
+            config.calibration = plain_calibration(Calibration({config.camera: camera}, depth_units=units))
+
+
+def _fixed_camera(meta: Any, name: str) -> Camera | None:
+    """Return the camera whose calibration is the same in all frames; None if there is none of known image size."""
+    # The statistics of the columns tell: LeRobot's tools keep them in every dataset that they write.
+    stats, columns = meta.stats or {}, (keys.intrinsics(name), keys.world_from_cam(name))
+    if not all(key in stats and np.array_equal(stats[key]["min"], stats[key]["max"]) for key in columns):
+        return None
+    size = _image_size(meta, name)
+    if size is None:
+        return None
+    intrinsics, world_from_cam = (stats[key]["min"] for key in columns)
+    try:
+        return stored_camera(intrinsics, world_from_cam, *size)
+    except CalibrationError as error:
+        raise CalibrationError(f"the dataset's calibration of camera {name!r}: {error}") from None
+
+
+def _image_size(meta: Any, camera: str) -> tuple[int, int] | None:
+    """Return the rows and columns of a camera's images, also where `symview-add-views` left them out."""
+    if keys.rgb(camera) in meta.features:
+        height, width, _ = meta.features[keys.rgb(camera)]["shape"]
+        return height, width
+    recorded = _calibration_file(meta)
+    in_file = recorded.cameras.get(camera) if recorded else None
+    return (in_file.height, in_file.width) if in_file else None
+
+
+def _calibration_file(meta: Any) -> Calibration | None:
+    """Return the content of the calibration file that `symview-add-views` was given; None if there was none."""
+    content = read_settings(Path(meta.root), ADDED_VIEWS).get("calibration")
+    return parse_calibration(content) if content else None
 
 
 def _changed_options(view: View, other: View) -> dict[str, Any]:

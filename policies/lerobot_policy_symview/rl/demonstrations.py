@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from lerobot_symview import keys
+from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation
 from lerobot_symview.runtime.staging import plain
@@ -40,7 +42,10 @@ def open_dataset(target: DatasetLocation) -> Any:
 
 
 def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
-    """Check that a dataset's task, robot and camera are those to simulate.
+    """Check that a dataset's workspace, task, robot and camera are those to simulate.
+
+    A dataset without `meta/symview_recording.json`, such as a merged one, may have several tasks, robots and cameras;
+    they are not checked.
 
     Raises:
         ValueError: if not; the message lists the flags that differ.
@@ -49,15 +54,15 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
     if camera not in simulated:
         raise ValueError(f"--policy.camera={camera} is not simulated; --env.camera.name is {env.camera.name!r}")
     info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
-    recorded = info.get("symview", {})
-    flags = {"task": env.task, "robot": env.robot}
-    pairs = {f"--env.{name}": (value, recorded[name]) for name, value in flags.items() if name in recorded}
-    for name, value in plain(asdict(env.workspace)).items():
-        if name in recorded.get("workspace", {}):
-            pairs[f"--env.workspace.{name}"] = (value, recorded["workspace"][name])
-    for name, value in plain(asdict(simulated[camera])).items():
-        if name in recorded.get("placement", {}):
-            pairs[f"--env.camera.{name}"] = (value, recorded["placement"][name])
+    recorded = read_settings(Path(dataset.root), RECORDING).get("env", {})
+    cameras = {spec["name"]: spec for spec in (recorded["camera"], *recorded["more_cameras"])} if recorded else {}
+    pairs: dict[str, tuple[Any, Any]] = {}
+    for flag, ours, theirs in (
+        ("--env", {"task": env.task, "robot": env.robot}, recorded),
+        ("--env.workspace", asdict(env.workspace), info.get("symview", {}).get("workspace", {})),
+        ("--env.camera", asdict(simulated[camera]), cameras.get(camera, {})),
+    ):
+        pairs |= {f"{flag}.{name}": (value, theirs[name]) for name, value in plain(ours).items() if name in theirs}
     differing = [
         f"{flag} is {ours!r}, the dataset has {theirs!r}" for flag, (ours, theirs) in pairs.items() if ours != theirs
     ]

@@ -24,6 +24,7 @@ from lerobot_symview.calibration.file import (
 )
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.features import camera_features
+from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
 from lerobot_symview.datasets.source import vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose, stored_camera
@@ -96,7 +97,7 @@ def test_a_camera_that_moves_within_an_episode_is_followed(tmp_path):
         fps=10,
         root=tmp_path / "wrist",
         use_videos=False,
-        features=camera_features("wrist", 48, 64, {})
+        features=camera_features("wrist", 48, 64, Workspace())
         | {keys.ACTION: {"dtype": "float32", "shape": (1,), "names": None}},
     )
     rng, expected = np.random.default_rng(0), []
@@ -142,9 +143,10 @@ def test_a_real_robot_dataset_needs_only_a_calibration_file(tmp_path, use_videos
     for name in ("reproj", "persp"):
         color = images_of(result, keys.view("front", name)) * 255
         assert np.abs(color - np.reshape([200, 100, 50], (1, 3, 1, 1))).max() <= (4 if use_videos else 0.01)
-    facts = json.loads((result / "meta" / "info.json").read_text())["features"][keys.view("front", "reproj")]["info"]
-    assert facts["symview"]["workspace"]["size"] == 0.3
-    assert parse_calibration(facts["symview"]["calibration"]).camera("front").height == 96
+    info = json.loads((result / "meta" / "info.json").read_text())
+    assert info["features"][keys.view("front", "reproj")]["info"]["symview"]["workspace"]["size"] == 0.3
+    made_with = read_settings(result, ADDED_VIEWS)
+    assert parse_calibration(made_with["calibration"]).camera("front").height == 96
 
 
 def test_views_are_bit_identical_offline_online_and_from_stored_matrices(tmp_path):
@@ -210,7 +212,7 @@ def test_a_calibration_file_that_misses_the_workspace_is_rejected(recorded, tmp_
 
 def test_a_recorded_camera_that_misses_the_workspace_logs_a_warning(recorded, tmp_path, caplog):
     with caplog.at_level("WARNING", logger="lerobot_symview.datasets.add_views"):
-        add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.6))))
+        add_views(views_config(recorded, tmp_path / "derived", workspace=Workspace((0.45, 0.3))))
     assert re.search(r"'side' sees \d+ % of the workspace: views will be empty outside its image", caplog.text)
 
 
