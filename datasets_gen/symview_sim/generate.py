@@ -18,7 +18,7 @@ from lerobot_symview.geometry.camera import project
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import run_command
 from lerobot_symview.runtime.executors import EXECUTORS
-from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, remove_partial
+from lerobot_symview.runtime.staging import is_complete, new_result, partial_folder
 from symview_sim.env import SymviewEnv
 from symview_sim.recording import (
     MAX_VIDEO_DEPTH,
@@ -100,23 +100,22 @@ def _write(config: GenerateConfig) -> Path:
     if is_complete(target, RECORDING, recording.description(), config.resume, "--dataset.root"):
         logger.info("%s is already complete", target)
         return target
-    begin_recording(recording, config.resume)
-    attempts = recorded_attempts(recording)
-    missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
-    with EXECUTORS[config.executor](config.num_workers, "symview_sim.recording") as executor:
-        with tqdm(desc=config.env.task, total=config.num_episodes, initial=len(attempts), unit="episode") as bar:
-            done, tried = len(attempts), sum(attempts.values())
-            for taken in executor.run(partial(record_episode, recording), missing):
-                done, tried = done + 1, tried + taken
-                bar.set_postfix_str(f"expert succeeds {done / tried:.0%}", refresh=False)
-                bar.update()
-        shards = recording.shards()
-        written = executor.run(partial(write_shard, recording), shards)
-        import lerobot.datasets  # noqa: F401  takes seconds, in parallel with the workers
+    with new_result(target, recording.description(), config.resume, "--dataset.root"):
+        attempts = recorded_attempts(recording)
+        missing = [episode for episode in range(config.num_episodes) if episode not in attempts]
+        with EXECUTORS[config.executor](config.num_workers, "symview_sim.recording") as executor:
+            with tqdm(desc=config.env.task, total=config.num_episodes, initial=len(attempts), unit="episode") as bar:
+                done, tried = len(attempts), sum(attempts.values())
+                for taken in executor.run(partial(record_episode, recording), missing):
+                    done, tried = done + 1, tried + taken
+                    bar.set_postfix_str(f"expert succeeds {done / tried:.0%}", refresh=False)
+                    bar.update()
+            shards = recording.shards()
+            written = executor.run(partial(write_shard, recording), shards)
+            import lerobot.datasets  # noqa: F401  takes seconds, in parallel with the workers
 
-        folders = list(tqdm(written, desc="writing", total=len(shards), unit="shard"))
-    join_shards(recording, sorted(folders)).rename(target)
-    remove_partial(recording.folder)
+            folders = list(tqdm(written, desc="writing", total=len(shards), unit="shard"))
+        join_shards(recording, sorted(folders))
     logger.info("wrote %d demonstrations to %s; the expert succeeded in %.1f %%", done, target, 100 * done / tried)
     return target
 
@@ -144,13 +143,6 @@ def plan_recording(config: GenerateConfig, target: Path) -> Recording:
     )
     env.close()
     return recording
-
-
-def begin_recording(recording: Recording, resume: bool) -> None:
-    """Create the folders of a recording, or check that those that exist belong to it."""
-    open_partial(recording.folder, recording.description(), resume)
-    for pieces in ("episodes", "shards"):
-        (recording.folder / pieces).mkdir(exist_ok=True)
 
 
 def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:

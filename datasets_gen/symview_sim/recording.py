@@ -27,7 +27,7 @@ import numpy as np
 
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.metadata import RECORDING
-from lerobot_symview.runtime.staging import disk_errors, part_of, plain
+from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of, plain
 from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import EnvSettings
 
@@ -84,6 +84,7 @@ def record_episode(recording: Recording, episode: int) -> int:
     content: dict[str, Any] = {**frames, ATTEMPTS_KEY: attempts}
     try:
         with disk_errors(recording.folder):
+            file.parent.mkdir(exist_ok=True)
             with part.open("wb") as stream:
                 np.savez(stream, **content)
             part.replace(file)
@@ -122,11 +123,11 @@ def write_shard(recording: Recording, shard: range) -> Path:
     return folder
 
 
-def join_shards(recording: Recording, shards: list[Path]) -> Path:
-    """Aggregate the shards into one dataset, complete its metadata and return its folder."""
+def join_shards(recording: Recording, shards: list[Path]) -> None:
+    """Aggregate the shards into one dataset and complete its metadata."""
     from lerobot.datasets import aggregate_datasets
 
-    joined = recording.folder / "dataset"
+    joined = recording.folder / DATASET
     if joined.exists():
         shutil.rmtree(joined)
     attempts = recorded_attempts(recording)
@@ -147,7 +148,6 @@ def join_shards(recording: Recording, shards: list[Path]) -> Path:
         stats.write_text(json.dumps(json.loads(stats.read_text()), indent=4, sort_keys=True))  # the order varies
         content = recording.description() | {"expert_success_rate": len(attempts) / sum(attempts.values())}
         (joined / "meta" / RECORDING).write_text(json.dumps(content, indent=4))
-    return joined
 
 
 def _create_dataset(recording: Recording, root: Path) -> Any:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_symview.runtime.cli import run_command
+from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_eval.demo_report import write_report
 from symview_eval.stages import Stage, run_stages
 
@@ -128,10 +129,11 @@ def demo(config: DemoConfig) -> Path:
     pipeline = stages(config)
     os.environ |= environment
     report = config.output_dir / "report.html"
-    before = (config.output_dir / "stages.json").read_bytes() if report.exists() else b""
-    seconds = run_stages(pipeline, config.output_dir, environment)
-    if (config.output_dir / "stages.json").read_bytes() != before:
-        write_report(report, pipeline, seconds)
+    with locked(config.output_dir / RUN_LOCK, config.output_dir, "--output_dir"):
+        before = (config.output_dir / "stages.json").read_bytes() if report.exists() else b""
+        seconds = run_stages(pipeline, config.output_dir, environment)
+        if (config.output_dir / "stages.json").read_bytes() != before:
+            write_report(report, pipeline, seconds)
     logger.info("report: %s", report.resolve())
     return report
 

@@ -31,7 +31,7 @@ from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
-from lerobot_symview.runtime.staging import is_complete, open_partial, partial_folder, plain, remove_partial
+from lerobot_symview.runtime.staging import is_complete, new_result, partial_folder, plain
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 
@@ -134,22 +134,20 @@ def _write(config: AddViewsConfig) -> Path:
         source = SourceDataset(config.dataset.folder())
     target = config.target().folder()
     _check_apart(source.folder, target)
-    with EXECUTORS["local"](config.num_workers, "lerobot_symview.datasets.derivation") as executor:
-        derivation = _plan(config, source, partial_folder(target))
-        description = _description(config, derivation)
-        if is_complete(target, ADDED_VIEWS, description, config.resume, "--new_root"):
-            logger.info("%s is already complete", target)
-            return target
-        _check_first_frame(derivation, source)
-        parts = cut_parts(source)
-        open_partial(derivation.folder, description, config.resume)
-        names = ", ".join(derivation.views)
-        with tqdm(desc=names, total=source.info["total_frames"], unit="frame") as bar:
-            for frames in executor.run(partial(write_part, derivation), list(enumerate(parts))):
-                bar.update(frames)
-    finish(derivation, parts, description).rename(target)
-    remove_partial(derivation.folder)
-    logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
+    executor = EXECUTORS["local"](config.num_workers, "lerobot_symview.datasets.derivation")  # starts while this plans
+    derivation = _plan(config, source, partial_folder(target))
+    description = _description(config, derivation)
+    if is_complete(target, ADDED_VIEWS, description, config.resume, "--new_root"):
+        logger.info("%s is already complete", target)
+        return target
+    _check_first_frame(derivation, source)
+    parts, names, frames = cut_parts(source), ", ".join(derivation.views), source.info["total_frames"]
+    with new_result(target, description, config.resume, "--new_root"):
+        with executor, tqdm(desc=names, total=frames, unit="frame") as bar:
+            for count in executor.run(partial(write_part, derivation), list(enumerate(parts))):
+                bar.update(count)
+        finish(derivation, parts, description)
+    logger.info("wrote %d frames with %s to %s", frames, names, target)
     return target
 
 

@@ -31,7 +31,7 @@ from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.staging import disk_errors, part_of
+from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of
 from lerobot_symview.views import View
 
 PART_FRAMES = 200  # least frames of a part, unless its source file has fewer
@@ -67,7 +67,7 @@ class Derivation:
     @property
     def dataset(self) -> Path:
         """Folder of the unfinished result."""
-        return self.folder / "dataset"
+        return self.folder / DATASET
 
     def open_source(self) -> SourceDataset:
         """Return the source dataset; its metadata is cached per process."""
@@ -218,8 +218,8 @@ def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArra
     return packed
 
 
-def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> Path:
-    """Add videos and metadata to the result once all its tables are written; return its folder."""
+def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> None:
+    """Add videos and metadata to the result once all its tables are written."""
     source = derivation.open_source()
     with disk_errors(derivation.folder):
         for key, feature in source.features.items():
@@ -242,7 +242,6 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
         stats = {key: value for key, value in stats.items() if key not in derivation.dropped} | totals
         (meta / "stats.json").write_text(json.dumps(stats, indent=4, sort_keys=True))
         (meta / ADDED_VIEWS).write_text(json.dumps(description, indent=4))
-    return derivation.dataset
 
 
 def _collect_statistics(

@@ -1,7 +1,9 @@
 """Results are written atomically: to `<target>.partial`, which is renamed to `<target>` once it is complete.
 
+<target>.partial.lock                 locked by the run that writes the result
 <target>.partial/request.json         settings of the result; a resumed run must have the same settings
 <target>.partial/request.json.done    the same file, renamed once the result is moved and the folder is being removed
+<target>.partial/dataset              the result, moved to <target> at the end
 <target>.partial/...                  finished parts, each complete or absent
 
 A folder of that name without either file was not created by this module and is never modified.
@@ -13,15 +15,17 @@ import errno
 import json
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.runtime.locking import locked
 
 REQUEST = "request.json"
 DONE = f"{REQUEST}.done"
+DATASET = "dataset"
 
 
 def partial_folder(target: Path) -> Path:
@@ -45,17 +49,52 @@ def is_complete(target: Path, made_from: str, description: dict[str, Any], resum
         flag: command-line flag that sets `target`.
 
     Raises:
-        CommandError: if `target` exists and has another description, or `resume` is False.
+        CommandError: if `target` exists and has another description, or `resume` is False, or if the run that wrote it
+            is still removing its partial folder.
     """
     if not target.exists():
         return False
     file = target / "meta" / made_from
-    if resume and file.exists() and description.items() <= json.loads(file.read_text()).items():
-        folder = partial_folder(target)
-        if (folder / DONE).exists() or _request(folder) == description:
-            remove_partial(folder)
-        return True
-    raise CommandError(f"{target} exists already: choose another {flag} or remove it")
+    if not (resume and file.exists() and description.items() <= json.loads(file.read_text()).items()):
+        raise CommandError(f"{target} exists already: choose another {flag} or remove it")
+    folder = partial_folder(target)
+    if folder.exists():
+        with _locked(target, flag):
+            if (folder / DONE).exists() or _request(folder) == description:
+                remove_partial(folder)
+    return True
+
+
+@contextmanager
+def new_result(target: Path, description: dict[str, Any], resume: bool, flag: str) -> Iterator[None]:
+    """Write `target` inside the context: open its partial folder, lock it, and at the end move the result to `target`.
+
+    Args:
+        target: folder of the result, which is written to `DATASET` in the partial folder.
+        description: settings of this run.
+        resume: whether to continue an interrupted run.
+        flag: command-line flag that sets `target`.
+
+    Raises:
+        CommandError: if another run is writing `target` or has written it meanwhile, or as `open_partial` does.
+    """
+    folder = partial_folder(target)
+    with _locked(target, flag):
+        if target.exists():
+            raise CommandError(f"{target} exists already: choose another {flag} or remove it")
+        open_partial(folder, description, resume)
+        yield
+        if target.exists():
+            raise CommandError(
+                f"another program has created {target}: move it elsewhere and repeat the command with --resume=true"
+            )
+        (folder / DATASET).rename(target)
+        remove_partial(folder)
+
+
+def _locked(target: Path, flag: str) -> AbstractContextManager[None]:
+    folder = partial_folder(target)
+    return locked(folder.with_name(f"{folder.name}.lock"), target, flag)
 
 
 def open_partial(folder: Path, description: dict[str, Any], resume: bool) -> None:

@@ -18,12 +18,13 @@ from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
-from lerobot_symview.runtime.staging import plain
+from lerobot_symview.runtime.staging import new_result, open_partial, plain
 from symview_sim import recording
 from symview_sim.demonstration import demonstrate, episode_seed
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from tests.conftest import EPISODES
+from tests.helpers.datasets import contents
 from tests.helpers.files import largest_file
 
 pytestmark = pytest.mark.long
@@ -190,6 +191,16 @@ def test_an_interrupted_recording_needs_resume_and_the_same_request(small_shards
         generate(config(tmp_path / "data", env=replace(SMALL, segmentation=True), resume=True))
 
 
+def test_a_second_run_is_refused_while_the_first_is_alive(tmp_path):
+    with new_result(tmp_path / "data", {}, resume=False, flag="--dataset.root"):
+        before = contents(tmp_path)
+        for resume in (False, True):
+            with pytest.raises(CommandError, match=rf"is being written by process {os.getpid()} .*--dataset\.root"):
+                generate(config(tmp_path / "data", resume=resume))
+        assert contents(tmp_path) == before
+        (tmp_path / "data.partial" / "dataset").mkdir()
+
+
 def test_leftovers_of_an_interrupted_clean_up_are_ignored(small_shards, tmp_path):
     plan = _begun(tmp_path)
     (plan.folder / "request.json").rename(plan.folder / "request.json.done")
@@ -268,7 +279,7 @@ def _begun(folder, **options):
     from symview_sim import generate as module
 
     plan = module.plan_recording(config(folder / "data", **options), folder / "data")
-    module.begin_recording(plan, resume=False)
+    open_partial(plan.folder, plan.description(), resume=False)
     for episode in range(2):
         recording.record_episode(plan, episode)
     return plan

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import CommandError, run_command, subcommand
 from lerobot_symview.runtime.executors import EXECUTORS
+from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_eval.experiments.grid import EXPERIMENTS, Cell, select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import finished_results, unfinished_cells
@@ -78,7 +79,7 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
         All selected cells, with and without an earlier result.
 
     Raises:
-        CommandError: if cells failed; raised after all others have finished.
+        CommandError: if cells failed, raised after all others have finished, or if another run uses the output folder.
         ValueError: if the experiment has no such task or method.
     """
     scale = SCALES[config.scale]
@@ -89,7 +90,8 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
     missing = list(unfinished_cells(cells, config.results_dir, finished_results(config.results_dir, config.scale)))
     logger.info("%d cells, of which %d already have a result", len(cells), len(cells) - len(missing))
     if missing:
-        _run(missing, config)
+        with locked(config.output_dir / RUN_LOCK, config.output_dir, "--output_dir"):
+            _run(missing, config)
     return cells
 
 

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from lerobot_symview.runtime.staging import part_of
 from symview_eval.experiments.grid import Cell
 
 logger = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ def write_result(path: Path, result: Result) -> None:
     writer.writeheader()
     writer.writerows({name: _text(value) for name, value in asdict(point).items()} for point in result.checkpoints)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
+    part = part_of(path)
     part.write_text(stream.getvalue())
     part.rename(path)
 

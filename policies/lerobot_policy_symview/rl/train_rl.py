@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, push_policy, restore, save_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
@@ -16,6 +17,7 @@ from lerobot_policy_symview.rl.metrics import MetricsLogger, MetricsWindow
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.training import Training
 from lerobot_symview.runtime.cli import flagged, run_command
+from lerobot_symview.runtime.locking import RUN_LOCK, locked
 
 logger = logging.getLogger(__name__)
 
@@ -31,13 +33,19 @@ def train_rl(config: TrainRlConfig) -> Path:
     """Run or resume a training, and return its last checkpoint.
 
     Raises:
-        CommandError: if there is no dataset, or the content of the output folder does not fit.
+        CommandError: if there is no dataset, the content of the output folder does not fit, or another run is writing
+            to that folder.
         KeyboardInterrupt: if Ctrl-C was pressed, after saving a checkpoint.
     """
-    last = last_checkpoint(config)
-    description = describe(config)
     with flagged("--dataset"):
         dataset = open_dataset(config.dataset)
+    with locked(config.output_dir / RUN_LOCK, config.output_dir, "--output_dir"):
+        return _train(config, dataset)
+
+
+def _train(config: TrainRlConfig, dataset: Any) -> Path:
+    last = last_checkpoint(config)
+    description = describe(config)
     with Training(config, dataset) as training, _interruptions() as interruptions:
         run_id = config.wandb.run_id
         if last:

@@ -27,7 +27,9 @@ from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
 from lerobot_symview.errors import SymviewError
 from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_sim.settings import EnvSettings, RecordedDataset
+from tests.helpers.datasets import contents
 from tests.helpers.training import train
 
 pytestmark = pytest.mark.long
@@ -254,6 +256,17 @@ def test_weights_and_biases_logs_the_metrics_offline(recorded, tmp_path):
 def test_an_output_folder_with_a_different_run_is_refused(recorded, whole, options, message):
     with pytest.raises(SymviewError, match=message):
         train_rl(make_config(recorded, whole.parent.parent, **options))
+
+
+def test_a_second_run_is_refused_while_the_first_is_alive(recorded, whole):
+    config = make_config(recorded, whole.parent.parent, resume=True)
+    before = contents(config.output_dir)
+    with (
+        locked(config.output_dir / RUN_LOCK, config.output_dir, "--output_dir"),
+        pytest.raises(SymviewError, match=rf"is being written by process {os.getpid()} on .*--output_dir"),
+    ):
+        train_rl(config)
+    assert contents(config.output_dir) == before
 
 
 def test_a_missing_checkpoint_and_a_missing_dataset_are_reported(recorded, tmp_path):

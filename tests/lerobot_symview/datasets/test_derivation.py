@@ -86,6 +86,13 @@ def test_an_interrupted_run_is_resumed(recorded, reference, tmp_path, monkeypatc
     assert not (tmp_path / "derived.partial").exists()
 
 
+def add_views_command(source, target):
+    """Return the command with the settings of `views_config`."""
+    command = [Path(sys.executable).parent / "symview-add-views", "--dataset.repo_id=test/recorded"]
+    command += [f"--root={source}", "--new_repo_id=test/derived", f"--new_root={target}", "--resume=true"]
+    return [*command, "--views=[reproj, persp]", f"--size={VIEW_SIZE}"]
+
+
 FORKING = f"""
 import os, pathlib, sys
 import cv2, datasets
@@ -174,12 +181,27 @@ def test_a_source_of_several_files_gets_views_in_every_file(several_files, with_
         assert episode in pq.read_table(result.root / place, columns=["episode_index"])["episode_index"].to_pylist()
 
 
+def test_a_second_run_is_refused_while_the_first_is_paused(several_files, tmp_path):
+    """And the first, once it goes on, writes what it would have written alone."""
+    target, partial = tmp_path / "derived", tmp_path / "derived.partial"
+    process = subprocess.Popen(add_views_command(several_files, target), stdout=subprocess.DEVNULL)
+    while not partial.exists():
+        assert process.poll() is None
+        time.sleep(0.005)
+    process.send_signal(signal.SIGSTOP)
+    for resume in (False, True):
+        with pytest.raises(CommandError, match=f"derived is being written by process {process.pid} on .*--new_root"):
+            add_views(views_config(several_files, target, resume=resume))
+    process.send_signal(signal.SIGCONT)
+    assert process.wait() == 0
+    assert sorted(tmp_path.iterdir()) == [target, several_files]
+    assert contents(target) == contents(add_views(views_config(several_files, tmp_path / "alone")))
+
+
 def test_two_killed_worker_processes_keep_finished_parts(several_files, tmp_path):
     """SIGKILL before and during the parts; the resumed run is bit-identical to an uninterrupted one."""
     target, partial = tmp_path / "derived", tmp_path / "derived.partial"
-    command = [Path(sys.executable).parent / "symview-add-views", "--dataset.repo_id=test/recorded"]
-    command += [f"--root={several_files}", "--new_repo_id=test/derived", f"--new_root={target}", "--resume=true"]
-    command += ["--views=[reproj, persp]", f"--size={VIEW_SIZE}", "--num_workers=2"]
+    command = [*add_views_command(several_files, target), "--num_workers=2"]
     conditions = [lambda: partial.exists(), lambda: any(partial.glob("dataset/data/*/*.parquet"))]
     rng = np.random.default_rng(0)
     for condition in conditions:

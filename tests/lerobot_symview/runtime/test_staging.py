@@ -1,5 +1,7 @@
 """Files in `<target>.partial` that are removed, resumed or never modified."""
 
+import json
+import os
 import shutil
 from pathlib import Path
 
@@ -7,7 +9,15 @@ import pytest
 
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.runtime.cli import CommandError
-from lerobot_symview.runtime.staging import DONE, REQUEST, is_complete, open_partial, remove_partial
+from lerobot_symview.runtime.staging import (
+    DATASET,
+    DONE,
+    REQUEST,
+    is_complete,
+    new_result,
+    open_partial,
+    remove_partial,
+)
 from tests.helpers.datasets import contents, views_config
 
 DESCRIPTION = {"source": "test/recorded", "size": 76}
@@ -74,10 +84,47 @@ def test_an_interrupted_removal_is_completed_and_not_resumed(folder, monkeypatch
 def test_a_run_killed_during_cleanup_is_complete(recorded, tmp_path, monkeypatch):
     target, folder = tmp_path / "derived", tmp_path / "derived.partial"
     with monkeypatch.context() as patched:
-        patched.setattr("lerobot_symview.datasets.add_views.remove_partial", lambda folder: None)
+        patched.setattr("lerobot_symview.runtime.staging.remove_partial", lambda folder: None)
         add_views(views_config(recorded, target))
     before = contents(target)
     assert folder.exists()
     add_views(views_config(recorded, target, resume=True))
     assert contents(target) == before
     assert not folder.exists()
+
+
+def test_a_second_run_is_refused_with_and_without_resume(folder, tmp_path):
+    target = tmp_path / "target"
+    with new_result(target, DESCRIPTION, resume=False, flag="--new_root"):
+        for resume in (False, True):
+            with pytest.raises(CommandError, match=f"target is being written by process {os.getpid()}.*--new_root"):
+                new_result(target, DESCRIPTION, resume, "--new_root").__enter__()
+        (folder / DATASET / "meta").mkdir(parents=True)
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_run_that_has_waited_for_another_does_not_write_again(tmp_path):
+    target = tmp_path / "target"
+    target.mkdir()
+    with pytest.raises(CommandError, match="exists already"):
+        new_result(target, DESCRIPTION, True, "--new_root").__enter__()
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_target_created_by_another_program_is_kept_and_so_is_the_result(folder, tmp_path):
+    target = tmp_path / "target"
+    writing = new_result(target, DESCRIPTION, resume=False, flag="--new_root")
+    writing.__enter__()
+    (folder / DATASET).mkdir()
+    target.mkdir()
+    with pytest.raises(CommandError, match=r"another program has created .*target: move it"):
+        writing.__exit__(None, None, None)
+    assert {path.name for path in folder.iterdir()} == {DATASET, REQUEST}
+
+
+def test_a_complete_target_needs_no_lock(tmp_path, monkeypatch):
+    meta = tmp_path / "target" / "meta"
+    meta.mkdir(parents=True)
+    (meta / "made.json").write_text(json.dumps(DESCRIPTION))
+    monkeypatch.setattr("lerobot_symview.runtime.staging.locked", None)
+    assert is_complete(tmp_path / "target", "made.json", DESCRIPTION, True, "--new_root")

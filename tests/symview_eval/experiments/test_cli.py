@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import os
 import re
 import shutil
 import sys
@@ -14,6 +15,7 @@ from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_symview.rl.checkpoints import describe
 from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_eval.experiments import cells as cells_module
 from symview_eval.experiments import cli
 from symview_eval.experiments.cli import ExperimentConfig, run_experiment
@@ -155,6 +157,16 @@ def test_a_changed_rl_cell_starts_from_the_beginning(tmp_path, monkeypatch):
     for next_cell in (cell, cell, longer):
         assert cells_module.run_cell(dataclasses.replace(job, cell=next_cell)).failure == ""
     assert resumed == [False, True, False]
+
+
+def test_a_second_run_is_refused_while_the_first_is_alive(tmp_path):
+    chosen = config(tmp_path)
+    with (
+        locked(chosen.output_dir / RUN_LOCK, chosen.output_dir, "--output_dir"),
+        pytest.raises(CommandError, match=rf"is being written by process {os.getpid()} on .*--output_dir"),
+    ):
+        run_experiment("table1", chosen)
+    assert not chosen.results_dir.exists()
 
 
 def test_cells_run_on_a_ray_cluster(table1, tmp_path):
