@@ -11,6 +11,13 @@ class SymviewError(Exception):
     """Base class of errors that a user can correct; the message says how."""
 
 
+class OptionError(SymviewError):
+    """An option of a view, camera, workspace or environment has an invalid value.
+
+    It is no `ValueError`: draccus, LeRobot's command-line parser, hides the message of a `ValueError`.
+    """
+
+
 class CalibrationError(SymviewError, ValueError):
     """A camera's intrinsics or pose are invalid, or too little of the workspace is in its image."""
 

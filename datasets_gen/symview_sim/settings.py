@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from lerobot_symview.datasets.hub import HubOptions
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.placement import CameraSpec, top_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import lookup
@@ -25,7 +27,7 @@ class EnvSettings:
     """A task, a robot arm, the workspace and the cameras of an environment.
 
     Raises:
-        ValueError: if the task or robot is unknown, two cameras have the same name, a camera is named like the depth or
+        OptionError: if the task or robot is unknown, two cameras have the same name, a camera is named like depth or
             a view of another one, or a number is out of range.
     """
 
@@ -54,20 +56,23 @@ class EnvSettings:
         self.check()
 
     def check(self) -> None:
-        """Raise a ValueError unless the settings describe an environment."""
-        check_task(self.task)
-        lookup("robot", self.robot, ROBOTS)
-        if self.start_jitter < 0:
-            raise ValueError(f"start_jitter must not be negative, got {self.start_jitter}")
+        """Raise an OptionError unless the settings describe an environment."""
+        try:
+            check_task(self.task)
+            lookup("robot", self.robot, ROBOTS)
+        except ValueError as error:
+            raise OptionError(str(error)) from None
+        if not 0 <= self.start_jitter < math.inf:
+            raise OptionError(f"start_jitter must not be negative, got {self.start_jitter}")
         if self.max_steps < 1:
-            raise ValueError(f"max_steps must be at least 1, got {self.max_steps}")
+            raise OptionError(f"max_steps must be at least 1, got {self.max_steps}")
         names = [spec.name for spec in self.all_cameras]
         if len(set(names)) < len(names):
-            raise ValueError(f"cameras must differ in their names, got {', '.join(names)}")
+            raise OptionError(f"cameras must differ in their names, got {', '.join(names)}")
         for name in names:
             longer = [other for other in names if other.startswith(f"{name}_")]
             if longer:
-                raise ValueError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
+                raise OptionError(f"camera {longer[0]!r} is named like depth or a view of camera {name!r}: rename it")
 
     @property
     def all_cameras(self) -> tuple[CameraSpec, ...]:

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_symview.errors import CalibrationError
+from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
@@ -142,7 +142,7 @@ def parse_workspace(entries: Any) -> Workspace:
             x, y = map(float, entries["center"])
             return Workspace(center=(x, y), **arguments)
         return Workspace(**arguments)
-    except (TypeError, ValueError) as error:
+    except (OptionError, TypeError, ValueError) as error:
         raise CalibrationError(str(error)) from None
 
 

@@ -97,8 +97,8 @@ class AddViewsConfig:
         """Return the views by name.
 
         Raises:
-            ValueError: if a view or an option is unknown or invalid, or if a view has a one-channel output that
-                `for_stock_policies` cannot disable.
+            OptionError: if a view or an option is unknown or invalid.
+            ValueError: if a view has a one-channel output that `for_stock_policies` cannot disable.
         """
         views = views_from_flags(self.views, self.size, {"reproj": self.reproj, "persp": self.persp})
         if not self.for_stock_policies:

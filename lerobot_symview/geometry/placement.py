@@ -6,6 +6,7 @@ from dataclasses import astuple, dataclass, field, replace
 
 import numpy as np
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Array, Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -17,7 +18,11 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class CameraSpread:
-    """Largest deviation of a camera's pose from its nominal pose; sampled uniformly for every episode."""
+    """Largest deviation of a camera's pose from its nominal pose; sampled uniformly for every episode.
+
+    Raises:
+        OptionError: if a deviation is negative or not finite.
+    """
 
     elevation_deg: float = 0.0
     """Degrees; the sampled elevation stays within 1 to 90 degrees above the table."""
@@ -29,13 +34,17 @@ class CameraSpread:
     """Metres, along each axis of the look-at point."""
 
     def __post_init__(self) -> None:
-        if min(astuple(self)) < 0:
-            raise ValueError(f"a camera's spread must not be negative, got {self}")
+        if not all(0 <= deviation < np.inf for deviation in astuple(self)):
+            raise OptionError(f"a camera's spread must be finite and not negative, got {self}")
 
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole camera over the workspace, and the noise of its depth sensor."""
+    """A pinhole camera over the workspace, and the noise of its depth sensor.
+
+    Raises:
+        OptionError: if values are invalid; the message lists them all.
+    """
 
     name: str = "side"
     """Name of the camera in feature keys, such as `side`."""
@@ -71,8 +80,12 @@ class CameraSpec:
         problems = []
         if not self.name.isidentifier():
             problems.append("name must be an identifier")
+        if not np.isfinite([self.azimuth_deg, *self.target]).all():
+            problems.append(f"azimuth_deg and target must be finite, got {self.azimuth_deg:g} and {self.target}")
         if min(self.height, self.width) < 8:
             problems.append(f"height and width must be at least 8 pixels, got {self.height} x {self.width}")
+        if not 0 < self.fov_deg < 180:
+            problems.append(f"fov_deg must lie in (0, 180) degrees, got {self.fov_deg:g}")
         if not 0 < self.elevation_deg <= 90:
             problems.append(f"elevation_deg must lie in (0, 90] degrees, got {self.elevation_deg:g}")
         if self.intrinsics is not None and len(self.intrinsics) != 9:
@@ -81,12 +94,16 @@ class CameraSpec:
             problems.append(f"world_from_cam must be 16 numbers, got {len(self.world_from_cam)}")
         if self.world_from_cam is not None and self.varies:
             problems.append("spread needs a pose by angles, not world_from_cam")
-        if self.spread.distance >= self.distance:
+        if not 0 < self.distance < np.inf:
+            problems.append(f"distance must be positive metres, got {self.distance:g}")
+        elif self.spread.distance >= self.distance:
             problems.append(f"spread.distance must be smaller than distance, got {self.spread.distance:g}")
-        if self.depth_noise < 0 or not 0 <= self.depth_dropout <= 1:
-            problems.append("depth_noise must not be negative and depth_dropout must lie in [0, 1]")
+        if not 0 <= self.depth_noise < np.inf:
+            problems.append(f"depth_noise must not be negative, got {self.depth_noise:g}")
+        if not 0 <= self.depth_dropout <= 1:
+            problems.append(f"depth_dropout must lie in [0, 1], got {self.depth_dropout:g}")
         if problems:
-            raise ValueError(f"camera {self.name!r}: {'; '.join(problems)}")
+            raise OptionError(f"camera {self.name!r}: {'; '.join(problems)}")
 
     @property
     def varies(self) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Array, Camera, project
 
 
@@ -14,7 +15,7 @@ class Workspace:
     """A square, axis-aligned working area on the table z = 0.
 
     Raises:
-        ValueError: if a value is not finite, or a length is not positive.
+        OptionError: if a value is not finite, or a length is not positive.
     """
 
     center: tuple[float, float] = (0.45, 0.0)
@@ -26,9 +27,9 @@ class Workspace:
 
     def __post_init__(self) -> None:
         if not np.isfinite([*self.center, self.size, self.height_limit]).all():
-            raise ValueError(f"workspace values must be finite, got {self}")
+            raise OptionError(f"workspace values must be finite, got {self}")
         if self.size <= 0 or self.height_limit <= 0:
-            raise ValueError(
+            raise OptionError(
                 f"workspace size and height_limit must be positive metres, got {self.size:g} and {self.height_limit:g}"
             )
 

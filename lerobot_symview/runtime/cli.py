@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-from lerobot_symview.errors import SymviewError
+from lerobot_symview.errors import OptionError, SymviewError
 from lerobot_symview.registry import check_name
 
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
@@ -102,7 +102,7 @@ def run_command[Config](
         _end(program, _reasons(error), USAGE)
     try:
         main(config)
-    except ValueError as error:
+    except (ValueError, OptionError) as error:
         _end(program, str(error), USAGE)
     except (SymviewError, OSError) as error:
         _end(program, str(error), FAILURE)
@@ -141,6 +141,8 @@ def quiet() -> None:
 
 def _reasons(error: BaseException) -> str:
     """Join an error's message with those of its causes: draccus names the field, the cause names the value."""
+    if isinstance(error.__cause__, OptionError):  # draccus quotes it between Python classes
+        return f"--{'.'.join(getattr(error, 'key_path', ()))}: {error.__cause__}"
     messages = [str(error)]
     while error.__cause__ is not None:
         error = error.__cause__

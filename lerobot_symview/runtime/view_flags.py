@@ -12,13 +12,14 @@ from typing import Any
 import draccus
 from draccus.utils import DecodingError
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.views import View, ViewSpec, make_views
 
 
 def _decode(raw: Any, path: Sequence[str]) -> ViewSpec:
     try:
         return ViewSpec.parse(raw)
-    except ValueError as error:
+    except OptionError as error:
         raise DecodingError(path, str(error)) from None
 
 
@@ -35,7 +36,7 @@ def views_from_flags(specs: Iterable[ViewSpec], size: int | None, dotted: Mappin
         dotted: view name -> view with the options of dotted flags, such as `--reproj.clip=none`.
 
     Raises:
-        ValueError: if there is no view, or a view or an option is unknown or invalid.
+        OptionError: if there is no view, or a view or an option is unknown or invalid.
     """
     return make_views(_merged(spec, size, dotted.get(spec.name)) for spec in map(ViewSpec.parse, specs))
 

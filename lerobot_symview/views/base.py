@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
@@ -149,7 +150,7 @@ def make_view(name: str, **options: Any) -> View:
     """Return the view registered as `name`.
 
     Raises:
-        ValueError: if the view or an option is unknown, or an option's value is invalid.
+        OptionError: if the view or an option is unknown, or an option's value is invalid.
     """
     return ViewSpec(name, options).make()
 
@@ -172,28 +173,34 @@ class ViewSpec:
         """Return the specification given by a name or a mapping.
 
         Raises:
-            ValueError: if `entry` is neither.
+            OptionError: if `entry` is neither.
         """
         if isinstance(entry, ViewSpec):
             return entry
         if isinstance(entry, str):
             return cls(entry)
         if not isinstance(entry, Mapping) or not isinstance(entry.get("name"), str):
-            raise ValueError(f"a view must be a name or a mapping with a name and options, got {entry!r}")
+            raise OptionError(f"a view must be a name or a mapping with a name and options, got {entry!r}")
         return cls(entry["name"], {key: value for key, value in entry.items() if key != "name"})
 
     def make(self) -> View:
         """Return the view.
 
         Raises:
-            ValueError: if the view or an option is unknown, or an option's value is invalid.
+            OptionError: if the view or an option is unknown, or an option's value is invalid.
         """
-        cls = VIEWS[self.name]
+        try:
+            cls = VIEWS[self.name]
+        except ValueError as error:
+            raise OptionError(str(error)) from None
         known = option_names(cls)
         unknown = sorted(set(self.options) - set(known))
         if unknown:
-            raise ValueError(f"the view {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}")
-        return cls(**self.options)
+            raise OptionError(f"the view {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}")
+        try:
+            return cls(**self.options)
+        except (TypeError, ValueError) as error:  # such as a text compared with a number
+            raise OptionError(f"the view {self.name!r} cannot have the options {self.options}: {error}") from None
 
     def plain(self) -> dict[str, Any]:
         """Return the mapping that `parse` reads."""
@@ -218,15 +225,15 @@ def make_views(specs: Iterable[ViewSpec]) -> dict[str, View]:
     """Return the views by name.
 
     Raises:
-        ValueError: if `specs` is empty or contains a name twice.
+        OptionError: if `specs` is empty or contains a name twice, or a view is unknown or invalid.
     """
     views: dict[str, View] = {}
     for spec in specs:
         if spec.name in views:
-            raise ValueError(f"the view {spec.name!r} is given twice")
+            raise OptionError(f"the view {spec.name!r} is given twice")
         views[spec.name] = spec.make()
     if not views:
-        raise ValueError("expected at least one view, got none")
+        raise OptionError("expected at least one view, got none")
     return views
 
 
@@ -236,6 +243,6 @@ def gray_to_rgb(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def check_size(size: int) -> None:
-    """Raise a ValueError unless `size` is a valid number of rows and columns of a view."""
+    """Raise an OptionError unless `size` is a valid number of rows and columns of a view."""
     if not isinstance(size, Integral) or not SMALLEST <= size <= LARGEST:
-        raise ValueError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")
+        raise OptionError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
@@ -67,7 +68,7 @@ class PerspectiveView(View):
         if self.plane_height != "gripper" and (
             isinstance(self.plane_height, str) or not math.isfinite(self.plane_height)
         ):
-            raise ValueError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
+            raise OptionError(f"plane_height must be gripper or a height in metres, got {self.plane_height!r}")
 
     def without_gripper(self) -> PerspectiveView:
         """Return the view without the gripper image.

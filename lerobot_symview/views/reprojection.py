@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
@@ -119,14 +120,14 @@ class ReprojectedView(View):
     def __post_init__(self) -> None:
         check_size(self.size)
         if self.infill not in INFILLS:
-            raise ValueError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
+            raise OptionError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
         if self.clip not in ("gripper", "none") and (isinstance(self.clip, str) or not self.clip > -math.inf):
-            raise ValueError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
+            raise OptionError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
         for name, metres in {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor}.items():
             if not math.isfinite(metres):
-                raise ValueError(f"{name} must be finite metres, got {metres}")
+                raise OptionError(f"{name} must be finite metres, got {metres}")
         if not isinstance(self.source_scale, Integral) or not 1 <= self.source_scale <= 8:
-            raise ValueError(f"source_scale must be an integer from 1 to 8, got {self.source_scale}")
+            raise OptionError(f"source_scale must be an integer from 1 to 8, got {self.source_scale}")
 
     def without_gripper(self) -> ReprojectedView:
         """Return the view without clipping at the gripper."""

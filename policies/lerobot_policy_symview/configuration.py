@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -14,9 +15,12 @@ from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.symmetry.groups import GROUP_NAMES, make_group
 from lerobot_policy_symview.symmetry.representations import ThetaRepresentation, VectorRepresentation
 from lerobot_symview import keys
+from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
+from lerobot_symview.runtime.cli import flagged
+from lerobot_symview.runtime.flag_errors import flag_errors
 from lerobot_symview.views import VIEWS, View, ViewSpec
 
 CAMERA_IMAGES = ("side", "top")  # a camera's own image in place of a view
@@ -41,7 +45,11 @@ def from_method() -> Any:
 
 @dataclass
 class SymviewConfig(PreTrainedConfig):
-    """A policy on top-down views from freely placed cameras. The defaults are the paper's."""
+    """A policy on top-down views from freely placed cameras. The defaults are the paper's.
+
+    Raises:
+        FlagError: if a value is invalid, or values contradict each other; LeRobot's commands print the message.
+    """
 
     method: str = "reproj_equi"
     """Preset of the next six fields, one of the paper's methods; a field that is given as well takes precedence."""
@@ -98,13 +106,22 @@ class SymviewConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        with flag_errors():
+            self._apply_method()
+            self.check()
+
+    def _apply_method(self) -> None:
         preset = lookup("--policy.method", self.method, METHODS)
         if self.encoder == "plain" and self.group is None:
             self.group = "C1"
         for name, value in preset.items():
             if getattr(self, name) is None:
                 setattr(self, name, value)
-        self.view = ViewSpec.parse(self.view)
+        with flagged("--policy.view"):
+            self.view = ViewSpec.parse(self.view)
+
+    def check(self) -> None:
+        """Raise a ValueError or SymviewError that names the flag if a value is invalid or contradicts another."""
         for name, choices in CHOICES.items():
             self._check_choice(name, choices)
         ENCODERS.check(self.encoder, "--policy.encoder")
@@ -112,6 +129,15 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.width must be a multiple of 16 up to 1024, got {self.width}")
         if not 0 <= self.weight_averaging < 1:
             raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
+        if not 0 <= self.relaxation_weight < math.inf:
+            raise ValueError(f"--policy.relaxation_weight must not be negative, got {self.relaxation_weight}")
+        with flagged("--policy.workspace"):
+            parse_workspace(self.workspace)
+        if self.calibration:
+            with flagged("--policy.calibration"):
+                parse_calibration(self.calibration)
         for kind in ("STATE", "ACTION"):
             if self.normalization_mapping.get(kind, NormalizationMode.IDENTITY) != NormalizationMode.IDENTITY:
                 raise ValueError(
@@ -129,7 +155,8 @@ class SymviewConfig(PreTrainedConfig):
         if self.is_computed:
             check_name("--policy.view", self.view.name, (*CAMERA_IMAGES, *VIEWS))
             if self.view.name in VIEWS.builtin:  # other packages' views are imported when they are made
-                self.make_view()
+                with flagged(f"--policy.view={self.view.name}"):
+                    self.make_view()
         elif self.view.options:
             raise ValueError(f"--policy.view={self.view.name} is a camera's image and has no options: {self.view}")
 

@@ -25,8 +25,9 @@ class SymviewBcConfig(SymviewConfig):
     opens the gripper to exactly the same aperture every time, a policy does not: without noise, the policy's own
     apertures are out of distribution."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        """Check the fields of all policies and those of behaviour cloning."""
+        super().check()
         self._check_choice("learning_rate_decay", ("none", "cosine"))
         if not 0 <= self.aperture_noise < math.inf:
             raise ValueError(f"--policy.aperture_noise must be finite and at least 0, got {self.aperture_noise}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -43,16 +44,19 @@ class SymviewSacfdConfig(SymviewConfig):
     bootstraps there, since a time limit says nothing about the value of a state; the code the paper builds on does not.
     """
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
+    def check(self) -> None:
+        """Check the fields of all policies and those of soft actor-critic."""
+        super().check()
         self._check_choice("target_update", ("polyak", "hard"))
         for name in ("discount", "target_tau"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"--policy.{name} must be above 0 and at most 1, got {getattr(self, name)}")
-        if self.initial_temperature <= 0:
+        if not 0 < self.initial_temperature < math.inf:
             raise ValueError(f"--policy.initial_temperature must be positive, got {self.initial_temperature}")
-        if self.bc_weight < 0:
+        if not 0 <= self.bc_weight < math.inf:
             raise ValueError(f"--policy.bc_weight must not be negative, got {self.bc_weight}")
+        if self.target_entropy is not None and not math.isfinite(self.target_entropy):
+            raise ValueError(f"--policy.target_entropy must be finite, got {self.target_entropy}")
         if self.target_interval < 1:
             raise ValueError(f"--policy.target_interval must be at least 1, got {self.target_interval}")
 

@@ -15,6 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
 from lerobot_symview.geometry.units import METRES
+from lerobot_symview.runtime.flag_errors import FlagError, flag_errors
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_sim.settings import EnvSettings
@@ -26,7 +27,11 @@ PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
 @EnvConfig.register_subclass("symview")
 @dataclass
 class SymviewEnvConfig(EnvSettings, EnvConfig):
-    """PyBullet tabletop tasks, observed by freely placed RGBD cameras."""
+    """PyBullet tabletop tasks, observed by freely placed RGBD cameras.
+
+    Raises:
+        FlagError: if a value is invalid; LeRobot's commands print the message.
+    """
 
     task: str = "block_picking"
     """Name of the task, such as `block_picking`; several names separated by commas; or `all`."""
@@ -43,7 +48,9 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
     """Options of the view `persp`."""
 
     def __post_init__(self) -> None:
-        self.settings()  # checks the fields for every task
+        with flag_errors("--env: "):
+            self.settings()  # checks the fields for every task
+            views = self._make_views()
         shapes: dict[str, tuple[int, ...]] = {}
         for camera in self.all_cameras:
             size = (camera.height, camera.width)
@@ -52,9 +59,9 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
                 shapes[keys.depth(camera.name)] = (*size, 1)
             if self.segmentation:
                 shapes[keys.segmentation(camera.name)] = (*size, 3)
-        for name, view in self._make_views().items():
+        for name, view in views.items():
             if view.needs_depth and not self.depth:
-                raise ValueError(f"the view {name!r} needs depth: keep --env.depth=true or use 'persp'")
+                raise FlagError(f"the view {name!r} needs depth: keep --env.depth=true or use 'persp'")
             for output, kind in view.outputs.items():
                 shapes[keys.view(self.camera.name, output)] = (view.size, view.size, 3 if kind == "rgb" else 1)
         self.features = {

@@ -5,6 +5,7 @@ from lerobot.envs.utils import preprocess_observation
 
 from lerobot_policy_symview import SymviewEnvConfig
 from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.runtime.flag_errors import FlagError
 from symview_sim import TASK_NAMES
 from symview_sim.settings import EnvSettings
 
@@ -54,7 +55,7 @@ def test_preprocessor_adds_the_views():
 
 
 def test_view_that_needs_depth_raises_without_depth():
-    with pytest.raises(ValueError, match="'reproj' needs depth"):
+    with pytest.raises(FlagError, match="'reproj' needs depth"):
         SymviewEnvConfig(depth=False, views=["reproj"])
 
 
@@ -64,7 +65,7 @@ def test_all_tasks_or_a_list_form_a_suite():
     assert {env.num_envs for group in suite.values() for env in group.values()} == {2}
     several = SymviewEnvConfig(task="block_picking, drawer_opening", camera=SMALL).create_envs(1)
     assert list(several) == ["block_picking", "drawer_opening"]
-    with pytest.raises(ValueError, match="did you mean 'drawer_opening'"):
+    with pytest.raises(FlagError, match="did you mean 'drawer_opening'"):
         SymviewEnvConfig(task="block_picking, drawer_open").create_envs(1)
 
 

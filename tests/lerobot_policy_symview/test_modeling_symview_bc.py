@@ -13,6 +13,7 @@ from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
+from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.views import VIEWS, ReprojectedView
 from tests.helpers.packages import registered
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
@@ -156,12 +157,12 @@ def test_training_noise_changes_only_the_aperture(monkeypatch):
 
 @pytest.mark.parametrize("noise", [-0.1, float("nan"), float("inf")])
 def test_invalid_noise_raises(noise):
-    with pytest.raises(ValueError, match="aperture_noise must be finite and at least 0"):
+    with pytest.raises(FlagError, match="aperture_noise must be finite and at least 0"):
         make_config(aperture_noise=noise)
 
 
 def test_noise_without_an_aperture_raises():
-    with pytest.raises(ValueError, match="needs a dimension `aperture` in --policy"):
+    with pytest.raises(FlagError, match="needs a dimension `aperture` in --policy"):
         make_config(aperture_noise=0.1, state_symmetry=["x", "y", "z"], gripper_input="vector")
 
 
@@ -241,7 +242,7 @@ def test_the_head_has_the_papers_parameter_count():
     ],
 )
 def test_invalid_configuration_errors_name_the_flag(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(FlagError, match=message):
         SymviewBcConfig(device="cpu", **options)
 
 
@@ -303,5 +304,5 @@ def test_configuration_choices_match_the_networks():
 def test_registered_views_are_choices():
     with registered(VIEWS, "other", ReprojectedView):
         assert [spec.name for spec in make_config(view="other", modality="rgb").views_to_make] == ["other"]
-        with pytest.raises(ValueError, match="did you mean 'other'"):
+        with pytest.raises(FlagError, match="did you mean 'other'"):
             make_config(view="othr", modality="rgb")

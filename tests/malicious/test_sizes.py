@@ -15,7 +15,8 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.errors import CalibrationError, SymviewError
+from lerobot_symview.errors import CalibrationError, OptionError, SymviewError
+from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.views import VIEWS, make_view
 from symview_eval.contact_sheet import TILE, with_outline
 from tests.helpers.cameras import make_camera
@@ -89,7 +90,7 @@ def test_distant_video_frames_are_refused(dataset, tmp_path):
 
 
 def test_symmetry_declarations_have_a_maximum_length():
-    with pytest.raises(ValueError, match=r"--policy\.state_symmetry has 100000 dimensions"):
+    with pytest.raises(FlagError, match=r"--policy\.state_symmetry has 100000 dimensions"):
         SymviewBcConfig(device="cpu", gripper_input="vector", state_symmetry=["scalar"] * 10**5)
 
 
@@ -140,7 +141,7 @@ def test_rows_larger_than_declared_are_refused(dataset, tmp_path, command):
 
 @pytest.mark.parametrize("view", list(VIEWS))
 def test_huge_views_are_refused(view):
-    with pytest.raises(ValueError, match="size must"):
+    with pytest.raises(OptionError, match="size must"):
         make_view(view, size=10**6)
 
 
@@ -176,7 +177,7 @@ def test_an_infinite_workspace_is_refused(entries):
 
 
 def test_huge_networks_are_refused():
-    with pytest.raises(ValueError, match=r"--policy\.width"):
+    with pytest.raises(FlagError, match=r"--policy\.width"):
         SymviewBcConfig(device="cpu", width=16 * 10**5)
 
 

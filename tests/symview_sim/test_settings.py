@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim import gym_id
@@ -76,7 +77,7 @@ def test_the_task_happens_in_the_workspace():
     ],
 )
 def test_invalid_settings_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OptionError, match=message):
         EnvSettings(**options)
 
 

@@ -12,7 +12,7 @@ from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
 from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
-from lerobot_symview.errors import CalibrationError
+from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.views import View, ViewSpec
 
@@ -66,7 +66,7 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
             config.workspace = dict(stored["symview"]["workspace"])
             config.make_view()
             parse_workspace(config.workspace)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OptionError) as error:
             raise ValueError(f"the dataset does not say how {config.color_key} was made: {error}") from None
     else:
         raw = features.get(config.raw_keys[0], {}).get("info") or {}

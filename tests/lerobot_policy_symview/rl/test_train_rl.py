@@ -27,6 +27,7 @@ from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
 from lerobot_symview.errors import SymviewError
 from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_sim.settings import EnvSettings, RecordedDataset
 from tests.helpers.datasets import contents
@@ -309,7 +310,7 @@ def test_demonstrations_of_a_different_scene_are_refused(recorded, tmp_path, env
                 {"bc_weight": -1.0}, {"target_update": "soft"}], ids=str,
 )  # fmt: skip
 def test_errors_name_the_invalid_policy_option(options):
-    with pytest.raises(ValueError, match=f"--policy.{next(iter(options))}"):
+    with pytest.raises(FlagError, match=f"--policy.{next(iter(options))}"):
         SymviewSacfdConfig(device="cpu", **options)
 
 

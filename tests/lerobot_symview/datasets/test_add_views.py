@@ -14,7 +14,7 @@ from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.errors import DatasetError, SymviewError
+from lerobot_symview.errors import DatasetError, OptionError, SymviewError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
@@ -152,7 +152,7 @@ def test_videos_are_copied_and_give_the_views_of_their_images(tmp_path):
 
 @pytest.mark.parametrize("views", [[], ["reprojection"]])
 def test_empty_or_unknown_views_are_rejected_by_the_configuration(views):
-    with pytest.raises(ValueError, match=r"view"):
+    with pytest.raises(OptionError, match=r"view"):
         AddViewsConfig(HubDataset("a/b"), views=views)
 
 
@@ -225,7 +225,7 @@ def test_list_options_override_size_and_dotted_flags(recorded, tmp_path):
     views = config.make_views()
     assert views["reproj"] == ReprojectedView(size=76, infill="local")
     assert views["persp"] == PerspectiveView(size=40, plane_height=0.025, gripper=False)
-    with pytest.raises(ValueError, match="the view 'persp' has no option plain_height; it has size, plane_height"):
+    with pytest.raises(OptionError, match="the view 'persp' has no option plain_height; it has size, plane_height"):
         AddViewsConfig(HubDataset("a/b"), views=[ViewSpec("persp", {"plain_height": 1})])
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from lerobot_symview.errors import CalibrationError
+from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import project
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread, top_camera
 
@@ -34,17 +34,17 @@ def test_a_camera_that_misses_the_workspace_is_rejected_with_the_visible_fractio
     ids=lambda f: str(f),
 )
 def test_invalid_placements_are_rejected(fields):
-    with pytest.raises(ValueError, match=next(iter(fields))):
+    with pytest.raises(OptionError, match=next(iter(fields))):
         CameraSpec(**fields)
 
 
 def test_a_negative_spread_is_rejected():
-    with pytest.raises(ValueError, match="negative"):
+    with pytest.raises(OptionError, match="negative"):
         CameraSpread(distance=-0.1)
 
 
 def test_a_spread_as_large_as_the_distance_is_rejected():
-    with pytest.raises(ValueError, match=r"spread\.distance must be smaller than distance"):
+    with pytest.raises(OptionError, match=r"spread\.distance must be smaller than distance"):
         CameraSpec(spread=CameraSpread(distance=0.9))
 
 
@@ -58,7 +58,7 @@ def test_elevations_are_sampled_uniformly_up_to_90_degrees(workspace):
 
 
 def test_a_spread_with_a_pose_matrix_is_rejected():
-    with pytest.raises(ValueError, match="spread needs a pose by angles"):
+    with pytest.raises(OptionError, match="spread needs a pose by angles"):
         CameraSpec(world_from_cam=tuple(np.eye(4).ravel()), spread=SPREAD)
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.workspace import Workspace
 
 
@@ -20,5 +21,5 @@ def test_rows_grow_with_x_and_columns_with_y(workspace):
 
 
 def test_a_workspace_of_size_zero_is_rejected():
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(OptionError, match="positive"):
         Workspace(size=0.0)

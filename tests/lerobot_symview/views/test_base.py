@@ -4,6 +4,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import VIEWS, Frame, ViewSpec, make_view, make_views, register_view, reproject, warp_table
@@ -123,7 +124,7 @@ def test_reprojection_without_depth_suggests_persp():
 
 
 def test_an_unknown_view_error_suggests_the_closest_name():
-    with pytest.raises(ValueError, match="did you mean 'reproj'"):
+    with pytest.raises(OptionError, match="did you mean 'reproj'"):
         make_view("reprojj")
 
 
@@ -149,7 +150,7 @@ def test_an_unknown_view_error_suggests_the_closest_name():
     ],
 )
 def test_invalid_options_are_rejected(name, options):
-    with pytest.raises(ValueError, match=next(iter(options))):
+    with pytest.raises(OptionError, match=next(iter(options))):
         make_view(name, **options)
 
 
@@ -209,7 +210,7 @@ def test_integer_depth_is_millimetres():
 
 def test_an_unknown_option_error_lists_the_known_options():
     frame = make_frame()
-    with pytest.raises(ValueError, match="the view 'reproj' has no option infil; it has size, infill"):
+    with pytest.raises(OptionError, match="the view 'reproj' has no option infil; it has size, infill"):
         reproject(frame.rgb, frame.depth, frame.camera, frame.workspace, infil="none")
 
 
@@ -228,7 +229,7 @@ def test_a_view_is_specified_by_name_or_mapping(entry, expected):
 
 @pytest.mark.parametrize("entry", [3, None, {}, {"plane_height": 0.025}, {"name": 3}])
 def test_invalid_view_specifications_are_rejected(entry):
-    with pytest.raises(ValueError, match="a view must be a name or a mapping with a name and options"):
+    with pytest.raises(OptionError, match="a view must be a name or a mapping with a name and options"):
         ViewSpec.parse(entry)
 
 
@@ -240,7 +241,7 @@ def test_invalid_view_specifications_are_rejected(entry):
     ],
 )
 def test_empty_lists_and_repeated_views_are_rejected(specs, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(OptionError, match=message):
         make_views(specs)
 
 
