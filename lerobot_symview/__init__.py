@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from lerobot_symview.datasets.hub import HubDataset as HubDataset
     from lerobot_symview.errors import CalibrationError as CalibrationError
     from lerobot_symview.errors import DatasetError as DatasetError
+    from lerobot_symview.errors import DivergenceError as DivergenceError
     from lerobot_symview.errors import OptionError as OptionError
     from lerobot_symview.errors import SymviewError as SymviewError
     from lerobot_symview.geometry.camera import Camera as Camera
@@ -44,7 +45,7 @@ _NAMES_OF_MODULE = {
     "calibration.file": ("Calibration", "read_calibration"),
     "datasets.add_views": ("AddViewsConfig", "add_views"),
     "datasets.hub": ("HubDataset",),
-    "errors": ("CalibrationError", "DatasetError", "OptionError", "SymviewError"),
+    "errors": ("CalibrationError", "DatasetError", "DivergenceError", "OptionError", "SymviewError"),
     "geometry.camera": ("Camera", "project", "unproject"),
     "geometry.placement": ("CameraSpec",),
     "geometry.workspace": ("Workspace",),

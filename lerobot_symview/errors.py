@@ -24,3 +24,7 @@ class CalibrationError(SymviewError, ValueError):
 
 class DatasetError(SymviewError):
     """A dataset is missing or malformed, or lacks a required feature or file."""
+
+
+class DivergenceError(SymviewError):
+    """A policy's action, its weights or the loss of its training are not finite numbers."""

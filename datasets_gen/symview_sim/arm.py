@@ -117,6 +117,12 @@ class Arm:
         travel, moved = self._open - self._closed, np.array([state[0] for state in states]) - self._closed
         return float(np.clip(moved @ travel / (travel @ travel), 0.0, 1.0))
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether the positions and velocities of all joints are finite numbers."""
+        states = self._client.getJointStates(self.body, [*self._joints, *self._gripper_joints])
+        return bool(np.isfinite([state[:2] for state in states]).all())
+
     def holds(self, body: int) -> bool:
         """Whether both fingers press on `body` from opposite sides."""
         normals = []

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera
@@ -82,6 +82,8 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[EnvObservation, dict]:
         """Start an episode. All its randomness follows from `seed`."""
         super().reset(seed=seed)
+        if self._scene is not None and not self._scene.arm.is_finite:
+            self.close()  # Bullet keeps such numbers, whatever the joints are reset to
         self._steps = 0
         largest = self.settings.start_jitter
         jitter = self.np_random.uniform(-largest, largest, size=3)
@@ -94,9 +96,13 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         return self._observe(), {"is_success": False}
 
     def step(self, action: NDArray[np.floating]) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
-        """Move the gripper by `action` (5,), clamped to the action space."""
+        """Move the gripper by `action` (5,), clamped to the action space.
+
+        Raises:
+            ValueError: if the action is not five finite numbers; the environment is unchanged.
+        """
         arm = self.scene.arm
-        *motion, aperture = np.clip(np.asarray(action, dtype=np.float64), self._action_low, self._action_high)
+        *motion, aperture = np.clip(checked_action(action), self._action_low, self._action_high)
         arm.move(np.clip(arm.position + motion[:3], *self._reach), arm.yaw + motion[3], aperture)
         self._steps += 1
         success = bool(self.episode_task.is_success(self.scene))
@@ -156,6 +162,25 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
 def make_env(render_mode: str | None = "rgb_array", **options: Any) -> SymviewEnv:
     """Return an environment; the entry point of `gymnasium.make`. `options` are the fields of `EnvSettings`."""
     return SymviewEnv(EnvSettings(**options), render_mode)
+
+
+def checked_action(action: ArrayLike) -> NDArray[np.float64]:
+    """Return an action as (5,) float64.
+
+    Raises:
+        ValueError: if it is not five finite numbers.
+    """
+    names = keys.ACTION_NAMES
+    try:
+        numbers = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the action must be {len(names)} numbers ({', '.join(names)}): {error}") from None
+    if numbers.shape != (len(names),):
+        raise ValueError(f"the action must have the shape ({len(names)},) ({', '.join(names)}), got {numbers.shape}")
+    wrong = [f"{name} is {number}" for name, number in zip(names, numbers, strict=True) if not np.isfinite(number)]
+    if wrong:
+        raise ValueError(f"the action must be finite: {', '.join(wrong)}")
+    return numbers
 
 
 def named_features(observation: EnvObservation) -> dict[str, NDArray[Any]]:

@@ -29,7 +29,7 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, ViewSpec
 from symview_sim.env import EnvObservation as RawObservation
-from symview_sim.env import SymviewEnv, named_features
+from symview_sim.env import SymviewEnv, checked_action, named_features
 from symview_sim.settings import EnvSettings
 
 logger = logging.getLogger(__name__)
@@ -127,7 +127,13 @@ class Simulators:
         return bool(self._workers[index][0].is_alive())
 
     def send(self, index: int, command: Reset | Step) -> None:
-        """Send a command to a simulator. Call `receive` before the next command."""
+        """Send a command to a simulator. Call `receive` before the next command.
+
+        Raises:
+            ValueError: if a step's action is not five finite numbers. Raised here: in the simulator it would end it.
+        """
+        if isinstance(command, Step):
+            checked_action(command.action)
         seed = command.seed if isinstance(command, Reset) else command.next_seed
         self._spare_seeds[index] = 0 if seed is None else seed
         with suppress(BrokenPipeError, ConnectionResetError):  # it died; `receive` handles this

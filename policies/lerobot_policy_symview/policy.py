@@ -32,6 +32,7 @@ from lerobot_policy_symview.symmetry.representations import VectorRepresentation
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.errors import DivergenceError
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
 """Takes n, the number of regular fields, and the actions' representation (G, A, A); returns the head."""
@@ -159,11 +160,34 @@ class SymviewPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the action (B, A) for observations (B, ...)."""
+        """Return the action (B, A) for observations (B, ...).
+
+        Raises:
+            DivergenceError: if it is not finite.
+        """
         self.eval()
         with self.precision():
             scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
-        return self.physical(scaled)
+        action = self.physical(scaled)
+        self.check_action(action, batch)
+        return action
+
+    def check_action(self, action: Tensor, batch: dict[str, Tensor]) -> None:
+        """Check that actions (B, A), chosen for the observations in `batch`, are finite.
+
+        Raises:
+            DivergenceError: if not; the message names what else is not finite, the weights or the observation.
+        """
+        if action.isfinite().all():
+            return
+        labels = zip(self.config.action_symmetry, action.isfinite().all(dim=0), strict=True)
+        entries = ", ".join(label for label, is_finite in labels if not is_finite)
+        observed = {key: value for key, value in batch.items() if isinstance(value, Tensor)}
+        causes = [f"its observation ({key}) is not finite" for key in not_finite(observed)]
+        if not_finite(self.state_dict()):
+            causes.append("its weights are not finite (its training diverged)")
+        reason = " and ".join(causes) or "a number in its network is too large"
+        raise DivergenceError(f"the policy's action is not finite (in {entries}): {reason}")
 
     def precision(self) -> AbstractContextManager[Any]:
         """Return the autocast context of the network: bfloat16 with `--policy.dtype=bfloat16`, else none."""
@@ -208,6 +232,11 @@ class SymviewPolicy(PreTrainedPolicy):
         observation, state = self.scene.form(batch, transform, crop_offset, shuffle=self.training)
         direction = self.scene.camera_direction(batch, transform)
         return observation, self.state_input(state, self.state_center, self.state_width, direction)
+
+
+def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
+    """Return the names of the tensors that contain a number that is not finite."""
+    return [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
 
 
 def _scale(stats: dict[str, Any] | None, representation: VectorRepresentation) -> tuple[Tensor, Tensor]:

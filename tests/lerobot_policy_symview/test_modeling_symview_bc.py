@@ -1,9 +1,12 @@
 """The behaviour-cloning policy: inputs, losses, configuration; `test_equivariance` tests its symmetry."""
 
+import sys
+
 import pytest
 import torch
 from lerobot.configs.types import NormalizationMode
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_symview.configuration import CHOICES, CROP_SIZES
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
@@ -13,6 +16,7 @@ from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
+from lerobot_symview.errors import DivergenceError
 from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.views import VIEWS, ReprojectedView
 from tests.helpers.packages import registered
@@ -81,6 +85,44 @@ def test_saved_and_loaded_policies_give_the_same_action(tmp_path):
     processors = make_pre_post_processors(loaded.config, str(tmp_path))
     actual = act(loaded, example_observation(policy.config), processors)
     torch.testing.assert_close(actual, expected, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "message"),
+    [
+        ("weights", r"not finite \(in x, y, z, yaw, aperture\): its weights are not finite"),
+        ("averaged", "its weights are not finite"),
+        ("state", r"its observation \(observation\.state\) is not finite$"),
+        ("both", r"its observation .* is not finite and its weights are not finite"),
+        ("overflow", r"\(in z\): a number in its network is too large"),
+    ],
+)
+def test_an_action_that_is_not_finite_is_reported_with_its_cause(spoilt, message):
+    policy = make_policy(gripper_input="vector", view="side", weight_averaging=0.9 * (spoilt == "averaged"))
+    batch = example_observation(policy.config)
+    if spoilt in ("state", "both"):
+        batch[keys.STATE][0, 2] = torch.inf
+    if spoilt in ("weights", "both", "averaged"):
+        next((policy.averaged or policy.network).parameters()).data.fill_(torch.nan)
+    if spoilt == "overflow":
+        policy.action_width[2] = policy.action_center[2] = 3e38
+        policy.best_action = lambda network, observation, state: torch.ones(1, 5)
+    for act in (policy.select_action, policy.predict_action_chunk):
+        with pytest.raises(DivergenceError, match=message):
+            act(batch)
+
+
+@pytest.mark.long
+def test_lerobot_eval_of_a_diverged_policy_ends_with_the_reason(tmp_path, monkeypatch):
+    policy = make_policy()
+    next(policy.network.parameters()).data.fill_(torch.nan)
+    for part in (policy, *make_symview_bc_pre_post_processors(policy.config)):
+        part.save_pretrained(tmp_path / "policy")
+    arguments = ["lerobot-eval", f"--policy.path={tmp_path / 'policy'}", "--policy.device=cpu", "--env.type=symview"]
+    arguments += ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'out'}"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(DivergenceError, match=r"action is not finite .*: its weights are not finite"):
+        lerobot_eval.main()
 
 
 def test_averaged_weights_follow_the_trained_ones_and_give_the_action():

@@ -234,6 +234,61 @@ def test_actions_are_clamped_to_the_action_space():
     assert moved[3] == pytest.approx(np.pi / 4, abs=0.03)
 
 
+FINITE = [0.02, 0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([np.nan, 0, 0, 0, 1], r"must be finite: dx is nan$"),
+        ([0, 0, np.inf, 0, -np.inf], "must be finite: dz is inf, aperture is -inf"),
+        (np.full(5, np.nan, np.float16), "dx is nan, dy is nan, dz is nan, dyaw is nan, aperture is nan"),
+        (FINITE[:4], r"must have the shape \(5,\) \(dx, dy, dz, dyaw, aperture\), got \(4,\)"),
+        ([FINITE], r"got \(1, 5\)"),
+        (None, r"got \(\)"),
+        ([*FINITE[:4], "open"], r"must be 5 numbers \(dx, .*could not convert string to float: 'open'"),
+        ([*FINITE[:4], 1j], "must be 5 numbers"),
+        ([*FINITE[:4], [1.0]], "must be 5 numbers"),
+    ],
+    ids=str,
+)
+def test_an_invalid_action_is_refused_and_changes_nothing(action, message):
+    env, expected = (EnvSettings("block_picking", camera=TINY).make() for _ in range(2))
+    for each in (env, expected):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    for _ in range(2):
+        np.testing.assert_array_equal(env.step(FINITE)[0]["agent_pos"], expected.step(FINITE)[0]["agent_pos"])
+
+
+@pytest.mark.parametrize("largest", [1e30, 1e308])
+def test_huge_actions_are_clamped(largest):
+    env = EnvSettings("block_picking", camera=TINY).make()
+    expected = _expert_states(env, 3)
+    env.reset(seed=0)
+    for signs in ([1, 1, -1, 1, 1], [-1, 1, 1, -1, -1]):
+        assert np.isfinite(env.step(largest * np.array(signs))[0]["agent_pos"]).all()
+    np.testing.assert_array_equal(_expert_states(env, 3), expected)
+
+
+@pytest.mark.parametrize("spoil", ["target", "joint", "velocity", "object"])
+def test_a_simulator_whose_state_is_not_finite_is_sound_after_a_reset(spoil):
+    """`step` lets no such number in; whoever uses the scene can."""
+    env = EnvSettings("block_picking", camera=TINY).make()
+    expected = _expert_states(env, 3)
+    env.reset(seed=0)
+    client, arm = env.scene.client, env.scene.arm
+    if spoil == "target":
+        arm.move([np.nan] * 3, 0.0, 1.0)
+    elif spoil == "object":
+        client.resetBasePositionAndOrientation(client.getBodyUniqueId(client.getNumBodies() - 1), [np.nan] * 3, [0] * 4)
+        env.scene.wait(5)
+    else:
+        client.resetJointState(arm.body, 0, *([np.nan] if spoil == "joint" else [0.0, np.nan]))
+    np.testing.assert_array_equal(_expert_states(env, 3), expected)
+
+
 def test_success_is_a_python_bool_on_reset_and_step():
     env = EnvSettings("block_picking").make()
     _, info = env.reset(seed=0)

@@ -107,6 +107,13 @@ def test_a_simulator_that_dies_at_every_start_raises_an_error():
             one.receive(0)
 
 
+def test_an_action_that_is_not_finite_is_refused_and_the_simulator_lives_on(simulators):
+    run(simulators, 0, Reset(1))
+    with pytest.raises(ValueError, match="the action must be finite: dy is nan"):
+        simulators.send(0, Step(np.array([0.0, np.nan, 0.0, 0.0, 1.0]), None))
+    assert not run(simulators, 0, Step(ACTIONS[0], None)).lost
+
+
 def test_ctrl_c_does_not_stop_a_simulator(simulators):
     run(simulators, 0, Reset(1))
     os.kill(simulators.process_ids[0], signal.SIGINT)

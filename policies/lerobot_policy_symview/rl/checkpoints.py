@@ -36,7 +36,12 @@ MAY_DIFFER = ("resume", "wandb", "output_dir")  # flags that may change when a r
 
 
 def save_checkpoint(training: Training, run_id: str | None) -> Path:
-    """Write a checkpoint atomically, and delete the replay buffers of earlier checkpoints."""
+    """Write a checkpoint atomically, and delete the replay buffers of earlier checkpoints.
+
+    Raises:
+        DivergenceError: if a weight is not finite; the earlier checkpoints are kept unchanged.
+    """
+    training.learner.check_weights()
     folder = get_step_checkpoint_dir(training.config.output_dir, training.config.steps, training.step)
     part = part_of(folder)
     model, state = part / PRETRAINED_MODEL_DIR, part / TRAINING_STATE_DIR

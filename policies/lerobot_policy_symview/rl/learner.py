@@ -18,7 +18,9 @@ from lerobot_policy_symview.inputs.observation_codec import ObservationCodec
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.nn.critic import Critic
 from lerobot_policy_symview.nn.layers import asymmetry
+from lerobot_policy_symview.policy import not_finite
 from lerobot_policy_symview.rl.replay import Sample
+from lerobot_symview.errors import DivergenceError
 
 WEIGHTS = "learner.safetensors"
 METRICS = ("critic_loss", "actor_loss", "bc_loss", "q_value", "entropy", "temperature")
@@ -58,6 +60,9 @@ class Learner(nn.Module):
 
         Returns:
             The absolute TD errors (B,), averaged over the two Q-functions, and the scalar `METRICS`.
+
+        Raises:
+            DivergenceError: if a TD error is not finite. Weights that this step has spoilt show in the next one.
         """
         self.policy.train()
         device = self.log_temperature.device
@@ -96,7 +101,10 @@ class Learner(nn.Module):
         self.policy.update()
         values = (critic_loss, actor_loss, bc_loss, q.mean(), -log_pi.mean(), temperature)
         metrics = {name: value.detach() for name, value in zip(METRICS, values, strict=True)}
-        return td_error.detach().abs().mean(dim=1).cpu().numpy(), metrics
+        td_errors: NDArray[np.float32] = td_error.detach().abs().mean(dim=1).cpu().numpy()
+        if not np.isfinite(td_errors).all():
+            raise DivergenceError("the critic's loss is not finite")
+        return td_errors, metrics
 
     def augment(self, sample: Sample) -> tuple[NetworkInput, NetworkInput, Tensor]:
         """Return the network's input before and after the actions, and the actions (B, A).
@@ -114,6 +122,17 @@ class Learner(nn.Module):
         observation, state = self.policy.network_input(frames, transform, crop_offset)
         before, after = zip(observation.chunk(2), state.chunk(2), strict=True)
         return before, after, action
+
+    def check_weights(self) -> None:
+        """Check that the weights of actor, critic and target critic and the temperature are finite.
+
+        Raises:
+            DivergenceError: if not; the message names them.
+        """
+        names = not_finite(self.state_dict())
+        if names:
+            parts = dict.fromkeys(name.split(".")[0] for name in names)
+            raise DivergenceError(f"weights are not finite, in {', '.join(parts)}")
 
     def save(self, folder: Path) -> None:
         """Write critic, target critic, temperature and optimisers; the policy saves the actor."""

@@ -10,12 +10,15 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
+
 from lerobot_policy_symview.rl.checkpoints import describe, last_checkpoint, push_policy, restore, save_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.learner import METRICS
 from lerobot_policy_symview.rl.metrics import MetricsLogger, MetricsWindow
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.training import Training
+from lerobot_symview.errors import DivergenceError
 from lerobot_symview.runtime.cli import flagged, run_command
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
 
@@ -35,6 +38,7 @@ def train_rl(config: TrainRlConfig) -> Path:
     Raises:
         CommandError: if there is no dataset, the content of the output folder does not fit, or another run is writing
             to that folder.
+        DivergenceError: if an action, the critic's loss or a weight is not finite; earlier checkpoints are kept.
         KeyboardInterrupt: if Ctrl-C was pressed, after saving a checkpoint.
     """
     with flagged("--dataset"):
@@ -53,7 +57,7 @@ def _train(config: TrainRlConfig, dataset: Any) -> Path:
         else:
             training.start()
         _log_replay_size(training)
-        with MetricsLogger(config, training.step, run_id, description) as logs:
+        with MetricsLogger(config, training.step, run_id, description) as logs, _divergence_reported(training):
             checkpoint, saved_step = last, training.step if last else None
             while training.step < config.steps and not interruptions:
                 training.joint_step()
@@ -88,6 +92,20 @@ def _log_replay_size(training: Training) -> None:
         replay.bytes_per_transition * replay.slots / 1e9,
         "on disk" if replay.is_on_disk else "of memory",
     )
+
+
+@contextmanager
+def _divergence_reported(training: Training) -> Iterator[None]:
+    """Add the step, the last checkpoint and the remedy to the error of a training that has diverged."""
+    try:
+        yield
+    except DivergenceError as error:
+        last = training.config.output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK
+        kept = f"the last checkpoint is {last.resolve()}" if last.exists() else "there is no checkpoint"
+        raise DivergenceError(
+            f"the training diverged after step {training.step}: {error}; {kept}: train again with a lower "
+            "--policy.learning_rate"
+        ) from None
 
 
 @contextmanager

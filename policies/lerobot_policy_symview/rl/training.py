@@ -116,10 +116,15 @@ class Training:
         self.seconds["total"] += time.perf_counter() - start
 
     def act(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Sample an action for every simulator: scaled, and in metres and radians, (simulators, A) each."""
+        """Sample an action for every simulator: scaled, and in metres and radians, (simulators, A) each.
+
+        Raises:
+            DivergenceError: if an action is not finite.
+        """
         self.policy.eval()
         with torch.no_grad(), self.policy.precision():
             scaled, _ = self.policy.sample_action(*self.policy.network_input(self._batch))
+        self.policy.check_action(scaled, self._batch)
         return scaled.cpu().numpy(), self._physical(scaled)
 
     def learn(self) -> None:

@@ -25,7 +25,7 @@ from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
 from lerobot_policy_symview.rl.training import Training
 from lerobot_symview import keys
-from lerobot_symview.errors import SymviewError
+from lerobot_symview.errors import DivergenceError, SymviewError
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
@@ -160,6 +160,34 @@ def test_an_incomplete_checkpoint_is_ignored(recorded, whole, tmp_path, monkeypa
         train_rl(config)
     monkeypatch.setattr(command, "save_checkpoint", real)
     assert_same_run(train_rl(replace(config, resume=True)), whole)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "step", "message"),
+    [
+        ("actor", 3, r"after step 3: the policy's action is not finite \(in .*\): its weights are not finite"),
+        ("critic", 3, "after step 3: the critic's loss is not finite"),
+        ("critic", 6, "after step 6: weights are not finite, in critic"),
+    ],
+)
+def test_a_diverged_training_is_reported_and_the_last_checkpoint_kept(
+    recorded, tmp_path, monkeypatch, spoilt, step, message
+):
+    real = Training.joint_step
+
+    def joint_step(self):
+        real(self)
+        if self.step == step:
+            network = {"actor": self.policy.network, "critic": self.learner.critic}[spoilt]
+            next(network.parameters()).data.fill_(torch.nan)
+
+    monkeypatch.setattr(Training, "joint_step", joint_step)
+    config = make_config(recorded, tmp_path / "run", save_every=2, eval_every=100, eval_episodes=1)
+    last = config.output_dir / "checkpoints" / f"{2 * ((step - 1) // 2):06d}"
+    with pytest.raises(DivergenceError, match=rf"{message}.*; the last checkpoint is {last}: train again with a lower"):
+        train_rl(config)
+    assert sorted(path.name for path in last.parent.iterdir())[-2:] == [last.name, "last"]
+    assert (last / "training_state" / "replay").is_dir()
 
 
 def test_frames_on_disk_give_the_same_run(recorded, whole, tmp_path):
