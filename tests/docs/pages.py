@@ -44,6 +44,7 @@ SMALL = {
         "--policy.down_dims": "[16, 32]",
     },
     "lerobot-eval": EVALUATION,
+    "lerobot-edit-dataset": {},
     "lerobot-dataset-viz": {"--save": 1, "--output-dir": "."},
 }
 """Command, or flag of a command -> flags that are added after those of the page and override them."""

@@ -6,6 +6,7 @@ import pytest
 
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.runtime.cli import DatasetLocation
 from tests.malicious.files import (
@@ -38,6 +39,13 @@ def test_malformed_metadata_is_refused(dataset, tmp_path, command, content):
     (dataset / "meta" / "info.json").write_bytes(content)
     with pytest.raises(SymviewError, match=r"info\.json"):
         command(dataset, tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"[1]", b"[" * 100_000, b"{"])
+def test_malformed_settings_are_refused(dataset, content):
+    (dataset / "meta" / RECORDING).write_bytes(content)
+    with pytest.raises(SymviewError, match=RECORDING):
+        read_settings(dataset, RECORDING)
 
 
 @both_commands

@@ -1,0 +1,68 @@
+"""The calibration that a policy reads from its training dataset."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lerobot_policy_symview.inputs.feature_contract import read_calibration
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
+from lerobot_symview.datasets.metadata import ADDED_VIEWS
+from lerobot_symview.errors import CalibrationError
+from tests.helpers.cameras import make_camera
+from tests.helpers.policies import make_config
+
+CAMERA = make_camera(size=32)
+FILE = plain_calibration(Calibration({"side": CAMERA, "other": make_camera(azimuth=90.0)}))
+IMAGE = {keys.rgb("side"): {"dtype": "image", "shape": (32, 32, 3)}}
+
+
+def metadata(folder, features=IMAGE, moved=0.0, intrinsics=CAMERA.intrinsics):
+    """Metadata of a dataset whose camera moved by some metres along x."""
+    pose = CAMERA.world_from_cam.ravel()
+    farthest = pose + moved * np.eye(16)[3]
+    stats = {
+        keys.intrinsics("side"): {"min": intrinsics.ravel(), "max": intrinsics.ravel()},
+        keys.world_from_cam("side"): {"min": pose, "max": farthest},
+    }
+    return SimpleNamespace(root=folder, features=features, stats=stats)
+
+
+def calibration_of(meta, **options):
+    config = make_config(**options)
+    config._runtime_dataset_meta = meta
+    read_calibration(config)
+    return config.calibration
+
+
+def test_the_calibration_of_a_fixed_camera_is_read(tmp_path):
+    camera = parse_calibration(calibration_of(metadata(tmp_path))).camera("side")
+    np.testing.assert_array_equal(camera.world_from_cam, CAMERA.world_from_cam.astype(np.float32))
+    np.testing.assert_array_equal(camera.intrinsics, CAMERA.intrinsics.astype(np.float32))
+    assert (camera.height, camera.width) == (32, 32)
+
+
+def test_a_camera_that_moved_has_no_calibration(tmp_path):
+    assert calibration_of(metadata(tmp_path, moved=0.02)) == {}
+    assert calibration_of(metadata(tmp_path, moved=0.02), calibration=FILE) == FILE
+
+
+def test_a_dataset_without_calibration_leaves_the_configuration_unchanged(tmp_path):
+    assert calibration_of(SimpleNamespace(root=tmp_path, features=IMAGE, stats=None)) == {}
+
+
+def test_the_image_size_of_views_alone_is_that_of_the_calibration_file(tmp_path):
+    meta = metadata(tmp_path, features={})
+    assert calibration_of(meta) == {}
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / ADDED_VIEWS).write_text(json.dumps({"calibration": FILE}))
+    assert list(parse_calibration(calibration_of(meta)).cameras) == ["side"]
+
+
+def test_an_invalid_calibration_is_an_error_where_it_is_used(tmp_path):
+    meta = metadata(tmp_path, intrinsics=np.zeros((3, 3)))
+    with pytest.raises(CalibrationError, match="the dataset's calibration of camera 'side'"):
+        calibration_of(meta)
+    assert calibration_of(meta, method="sideview_equi") == {}
