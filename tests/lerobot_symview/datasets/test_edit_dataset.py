@@ -213,7 +213,7 @@ def test_a_policy_trains_on_an_edited_dataset(operation, kind, options, recordin
     assert stored.world_from_cam.ravel().tolist() == poses[kind][0][0]
     images = {
         keys.rgb(camera): torch.rand(3, stored.height, stored.width),
-        keys.depth(camera): torch.full((1, stored.height, stored.width), 0.8),
+        keys.depth(camera): torch.from_numpy(plane_depth(stored)).float()[None],
         keys.STATE: torch.zeros(config.input_features[keys.STATE].shape),
     }
     matrices = {keys.intrinsics(camera): stored.intrinsics, keys.world_from_cam(camera): stored.world_from_cam}
