@@ -1,9 +1,15 @@
 """Feature names of a dataset, shared by the simulator, the views and the policies."""
 
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+
 STATE = "observation.state"
 ACTION = "action"
 STATE_NAMES = ["x", "y", "z", "yaw", "aperture"]
 ACTION_NAMES = ["dx", "dy", "dz", "dyaw", "aperture"]
+IMAGES, CALIBRATIONS = "observation.images.", "observation.camera."
+ORACLE = "top"  # the simulator's camera straight above the table
 
 
 def rgb(camera: str) -> str:
@@ -34,3 +40,54 @@ def world_from_cam(camera: str) -> str:
 def view(camera: str, output: str) -> str:
     """Output of a view rendered from `camera`; `output` is, for example, `reproj` or `reproj_height`."""
     return f"observation.images.{camera}_{output}"
+
+
+def of_camera(key: str, camera: str, other: str) -> str:
+    """Return the feature of camera `other` that corresponds to the feature `key` of `camera`."""
+    prefix = CALIBRATIONS if key.startswith(CALIBRATIONS) else IMAGES
+    return prefix + other + key.removeprefix(prefix + camera)
+
+
+def substitutes(names: Collection[str], camera: str, *alternatives: list[str]) -> list[str]:
+    """Return the cameras that can take the place of `camera`; one if it is clear, none if none is needed.
+
+    LeRobot's `--rename_map` renames single features: a camera's image, but not its depth, calibration and views. The
+    substitute is thus the camera with whose features those of `camera` are complete, but not without them: of each
+    pair, exactly one is there. The simulator's oracle takes no other camera's place.
+
+    Args:
+        names: the features of an observation or dataset.
+        camera: the camera whose features are needed.
+        alternatives: lists of features of `camera`, any of which suffices.
+    """
+    if any(set(needed) <= set(names) for needed in alternatives):
+        return []
+    found: set[str] = set()
+    for needed in alternatives:
+        candidates = [
+            other
+            for other in _cameras_with(names, max((key for key in needed if key not in names), key=len), camera)
+            if all((key in names) != (of_camera(key, camera, other) in names) for key in needed)
+        ]
+        if len(candidates) == 1:
+            return candidates
+        found.update(candidates)
+    return sorted(found)
+
+
+def _cameras_with(names: Collection[str], key: str, camera: str) -> list[str]:
+    """Return the other cameras that have the feature that corresponds to `key` of `camera`."""
+    prefix, suffix = of_camera(key, camera, "\0").split("\0")
+    others = {
+        name[len(prefix) : len(name) - len(suffix)]
+        for name in names
+        if name.startswith(prefix) and name.endswith(suffix) and len(name) > len(prefix) + len(suffix)
+    }
+    views = {other for other in others if any(other.startswith(f"{longer}_") for longer in others)}
+    return sorted(others - views - {camera, ORACLE})
+
+
+def as_camera[Value](features: Mapping[str, Value], camera: str, other: str, keys: Iterable[str]) -> dict[str, Value]:
+    """Return the features with those of camera `other` under the names `keys` of `camera`, where these are missing."""
+    moved = {of_camera(key, camera, other): key for key in keys if key not in features}
+    return {moved.get(key, key): value for key, value in features.items()}

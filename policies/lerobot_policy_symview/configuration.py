@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -109,6 +110,7 @@ class SymviewConfig(PreTrainedConfig):
         with flag_errors():
             self._apply_method()
             self.check()
+            self._name_inputs()
 
     def _apply_method(self) -> None:
         preset = lookup("--policy.method", self.method, METHODS)
@@ -119,6 +121,11 @@ class SymviewConfig(PreTrainedConfig):
                 setattr(self, name, value)
         with flagged("--policy.view"):
             self.view = ViewSpec.parse(self.view)
+
+    def _name_inputs(self) -> None:
+        from lerobot_policy_symview.inputs.feature_contract import name_inputs
+
+        name_inputs(self)
 
     def check(self) -> None:
         """Raise a ValueError or SymviewError that names the flag if a value is invalid or contradicts another."""
@@ -284,6 +291,25 @@ class SymviewConfig(PreTrainedConfig):
         if not self.is_computed:
             return [self.color_key] + ([keys.depth(self.seen_camera)] if self.modality == "rgbd" else [])
         return [keys.rgb(self.camera)] + ([keys.depth(self.camera)] if self.make_view().needs_depth else [])
+
+    def substitutes(self, names: Collection[str]) -> list[str]:
+        """Return the cameras of a dataset that can take the place of the policy's; none if this one is there."""
+        seen = [self.color_key] + ([self.height_key] if self.modality == "rgbd" and self.height_key else [])
+        return keys.substitutes(names, self.seen_camera, seen, self.raw_keys)
+
+    def own_names[Value](self, features: Mapping[str, Value]) -> dict[str, Value]:
+        """Return features, those of the one camera that can take the place of the policy's under its names."""
+        others, camera = self.substitutes(features), self.seen_camera
+        if len(others) != 1:
+            return dict(features)
+        views = [keys.view(camera, output) for output in self.make_view().outputs] if self.is_computed else []
+        calibration = [keys.intrinsics(camera), keys.world_from_cam(camera)]
+        return keys.as_camera(features, camera, others[0], [keys.rgb(camera), keys.depth(camera), *calibration, *views])
+
+    @property
+    def camera_calibration(self) -> dict[str, Any]:
+        """`calibration`, if it has `camera`; that of other cameras is of no use."""
+        return self.calibration if self.camera in self.calibration.get("cameras", {}) else {}
 
     @property
     def channels(self) -> int:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -26,6 +27,7 @@ from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.processor_allowlist import check_processor_files
+from lerobot_policy_symview.processor_pipelines import changed_options
 from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_transform
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
@@ -33,6 +35,8 @@ from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.errors import DivergenceError
+
+logger = logging.getLogger(__name__)
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
 """Takes n, the number of regular fields, and the actions' representation (G, A, A); returns the head."""
@@ -99,11 +103,23 @@ class SymviewPolicy(PreTrainedPolicy):
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
         """Load a policy as LeRobot does, then check that its processor files name only the policy's own steps.
 
+        Flags, and the dataset in fine-tuning, may give the configuration another camera, calibration or view. LeRobot
+        then makes the preprocessing from the configuration instead of loading it.
+
         Raises:
             ValueError: if a processor file names another step.
         """
         policy = super().from_pretrained(pretrained_name_or_path, **options)
-        check_processor_files(policy.config, str(pretrained_name_or_path), options)
+        saved = check_processor_files(policy.config, str(pretrained_name_or_path), options)
+        changed = changed_options(policy.config, saved) if saved is not None else []
+        if changed:
+            logger.info(
+                "the preprocessing of %s is replaced: views are made from the camera %r, with another %s",
+                pretrained_name_or_path,
+                policy.config.seen_camera,
+                ", ".join(changed),
+            )
+            policy.config.pretrained_path = None  # LeRobot loads the processors from here, or else makes them
         return policy
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
@@ -229,6 +245,7 @@ class SymviewPolicy(PreTrainedPolicy):
             transform: planar transform of each scene; by default none.
             crop_offset: (B, 2) in [0, 1), row and column relative to the largest offset; by default the centre crop.
         """
+        batch = self.scene.own_names(batch)
         observation, state = self.scene.form(batch, transform, crop_offset, shuffle=self.training)
         direction = self.scene.camera_direction(batch, transform)
         return observation, self.state_input(state, self.state_center, self.state_width, direction)

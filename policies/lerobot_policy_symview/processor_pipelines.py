@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import torch
@@ -32,9 +33,6 @@ def make_processors(
     Raises:
         ValueError: if the view uses the gripper's pose and the declared state lacks it.
     """
-    meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the processors
-    if depth_units is None:
-        depth_units = delivered_units(meta) if meta is not None else {}
     steps = make_default_policy_processor_steps(config, dataset_stats)
     return make_policy_processor_pipelines(
         input_steps=[
@@ -45,11 +43,28 @@ def make_processors(
                 views=config.views_to_make,
                 camera=config.camera,
                 workspace=config.workspace,
-                calibration=config.calibration,
+                calibration=config.camera_calibration,
                 gripper=config.gripper_indices,
-                depth_units=depth_units,
+                depth_units=_delivered_units(config) if depth_units is None else depth_units,
             ),
             steps.normalize,
         ],
         output_steps=[steps.unnormalize, steps.to_cpu],
     )
+
+
+def changed_options(config: SymviewConfig, saved: dict[str, Any]) -> list[str]:
+    """Return the options of the added step that flags or a dataset gave another value than a checkpoint's `saved`."""
+    step = next(step for step in make_processors(config)[0].steps if isinstance(step, ViewsProcessorStep))
+    options = json.loads(json.dumps(step.get_config()))
+    return [name for name, value in options.items() if saved.get(name) != value]
+
+
+def _delivered_units(config: SymviewConfig) -> dict[str, float]:
+    """Return the units of the training dataset's depth, by the names of the policy's camera."""
+    meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the processors
+    if meta is None:
+        return {}
+    units = delivered_units(meta)
+    named = config.own_names({key: units.get(key) for key in meta.features})
+    return {key: unit for key, unit in named.items() if unit is not None}

@@ -89,11 +89,12 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
         self._table_units: dict[tuple[str, torch.dtype], float] = {}
         self._logged: set[tuple[str, float]] = set()
+        self._substitutes: set[str] = set()
         self._checked = False
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
-        observation = self._in_metres(observation)
+        observation = self._in_metres(self._own_names(observation))
         missing = {
             name: view
             for name, view in self._views.items()
@@ -122,6 +123,23 @@ class ViewsProcessorStep(ObservationProcessorStep):
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """Keep the declared features unchanged: the policy names what it needs."""
         return features
+
+    def _own_names(self, observation: RobotObservation) -> RobotObservation:
+        """Return the observation with the names of `camera`, where those of another camera were not all renamed."""
+        made = [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
+        source = [keys.rgb(self.camera)]
+        if any(view.needs_depth for view in self._views.values()):
+            source.append(keys.depth(self.camera))
+        if self._fixed_camera is None:
+            source += self._matrix_keys
+        others = keys.substitutes(observation, self.camera, made, source) if made else []
+        if len(others) != 1:
+            return observation
+        if others[0] not in self._substitutes:
+            self._substitutes.add(others[0])
+            logger.info("the camera %r takes the place of %r", others[0], self.camera)
+        features = [keys.rgb(self.camera), keys.depth(self.camera), *self._matrix_keys, *made]
+        return keys.as_camera(observation, self.camera, others[0], features)
 
     def _in_metres(self, observation: RobotObservation) -> RobotObservation:
         """Convert all depth and height images to float metres, once per observation."""
@@ -190,7 +208,10 @@ class ViewsProcessorStep(ObservationProcessorStep):
         needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if uses_gripper else [])
         missing = [key for key in needed if key not in observation] + self._missing_matrices(observation)
         if missing:
-            raise KeyError(f"the views {views} need {missing}, the observation has {sorted(observation)}")
+            raise KeyError(
+                f"the views {views} need {missing}, the observation has {sorted(observation)}: name its camera with "
+                "--policy.camera, or rename its image with --rename_map"
+            )
         rgb = observation[color].detach()
         if rgb.dtype != torch.uint8:
             rgb = (rgb * 255).round().to(torch.uint8)

@@ -4,16 +4,16 @@ import sys
 
 from lerobot.scripts import lerobot_train
 
+NEW = ("--policy.type=symview_bc", "--policy.width=16", "--policy.crop_size=64")
 
-def train(monkeypatch, dataset, output, *options):
-    """Train for two steps; return the folder of the policy. Later options override earlier ones."""
+
+def train(monkeypatch, dataset, output, *options, policy=NEW):
+    """Train a policy for two steps; return its folder. Later options override earlier ones."""
     command = [
         "lerobot-train",
         "--dataset.repo_id=test/recorded",
         f"--dataset.root={dataset}",
-        "--policy.type=symview_bc",
-        "--policy.width=16",
-        "--policy.crop_size=64",
+        *policy,
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
         "--steps=2",

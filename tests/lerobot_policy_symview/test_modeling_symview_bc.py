@@ -312,7 +312,7 @@ def test_configured_calibration_replaces_the_observations(method):
     raw = example_observation(policy.config)
     expected = act(policy, raw)
     k, pose = (raw.pop(key)[0] for key in (keys.intrinsics("side"), keys.world_from_cam("side")))
-    with pytest.raises(KeyError, match=r"needs .*intrinsics"):
+    with pytest.raises(KeyError, match=r"needs .*intrinsics.*--policy.camera.*--rename_map"):
         act(policy, raw)
     side = {
         "height": 152,

@@ -227,7 +227,7 @@ def test_simulator_raises_if_the_declared_state_is_not_its_own(observed):
 
 def test_missing_input_error_names_the_key(observed):
     without = {key: value for key, value in observed.items() if "intrinsics" not in key}
-    with pytest.raises(KeyError, match=r"observation\.camera\.side\.intrinsics"):
+    with pytest.raises(KeyError, match=r"observation\.camera\.side\.intrinsics.*--policy.camera.*--rename_map"):
         ViewsProcessorStep(views=OPTIONS).observation(without)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from lerobot_symview.views import View, ViewSpec
 
 Features = dict[str, dict[str, Any]]
 
+logger = logging.getLogger(__name__)
+
 
 def read_features(config: SymviewConfig, features: Features) -> None:
     """Set a configuration's inputs, outputs, view options and workspace from a dataset's features.
@@ -25,16 +28,20 @@ def read_features(config: SymviewConfig, features: Features) -> None:
     LeRobot accepts no visual feature at evaluation that was not declared in training, so the camera's raw images are
     declared even where training reads only views made from them.
 
+    A checkpoint's camera may have another name in the dataset, which LeRobot allows with `--rename_map` only.
+
     Raises:
         ValueError: if the dataset lacks what the policy needs, or contradicts its declarations.
     """
     _check_vectors(config, features)
+    features = _own_names(config, features)
     _read_view(config, features)
     has_raw = all(key in features for key in config.raw_keys)
     if not has_raw and config.color_key not in features:
         raise ValueError(
             f"--policy.view={config.view.name} needs {config.raw_keys} or {config.color_key!r}; "
-            f"the dataset has {sorted(key for key in features if 'images' in key)}"
+            f"the dataset has {sorted(key for key in features if 'images' in key)}: "
+            "for the view of another camera, give its name by --policy.camera"
         )
     _check_size(config, features)
     visuals = list(config.raw_keys)
@@ -47,6 +54,12 @@ def read_features(config: SymviewConfig, features: Features) -> None:
     config.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, tuple(features[keys.ACTION]["shape"]))}
 
 
+def name_inputs(config: SymviewConfig) -> None:
+    """Name the inputs of a checkpoint by its camera, which a flag may have changed: LeRobot compares them with data."""
+    if config.input_features:
+        config.input_features = config.own_names(config.input_features)
+
+
 def _check_vectors(config: SymviewConfig, features: Features) -> None:
     for representation, key in ((config.states, keys.STATE), (config.actions, keys.ACTION)):
         if key not in features:
@@ -55,6 +68,24 @@ def _check_vectors(config: SymviewConfig, features: Features) -> None:
         are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
         size = int(features[key]["shape"][0])
         representation.check(size, key, names if are_names and config.group != "C1" else None)
+
+
+def _own_names(config: SymviewConfig, features: Features) -> Features:
+    """Return the features with the names of the policy's camera, where the dataset's camera has another name."""
+    others = config.substitutes(features)
+    if not others:
+        return features
+    flags = " or ".join(f"--policy.camera={other}" for other in others)
+    if len(others) > 1 or config.pretrained_path is None:  # LeRobot renames features for checkpoints only
+        raise ValueError(f"the dataset has no images of the camera {config.seen_camera!r}: use {flags}")
+    logger.info(
+        "the dataset has no images of the camera %r: those of %r take their place, if --rename_map renames them; %s "
+        "trains under the dataset's name",
+        config.seen_camera,
+        *others,
+        flags,
+    )
+    return config.own_names(features)
 
 
 def _read_view(config: SymviewConfig, features: Features) -> None:
@@ -80,18 +111,21 @@ def read_calibration(config: SymviewConfig) -> None:
     """Set a configuration's calibration to that of a camera that never moved in the training dataset.
 
     It is for observations without calibration, such as a real robot's. If the camera moved, or the dataset lacks its
-    calibration, the configuration is unchanged.
+    calibration, the configuration is unchanged, unless its calibration is that of another camera.
 
     Raises:
         CalibrationError: if the calibration in the dataset is invalid.
     """
     meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
     if meta is not None and (config.is_computed or config.sees_points or config.camera_direction):
-        camera = _fixed_camera(meta, config.camera)
+        name = next(iter(config.substitutes(meta.features)), config.camera)
+        camera = _fixed_camera(meta, name)
         if camera is not None:
             recorded = _calibration_file(meta)
-            units = recorded.depth_units if recorded else {}
+            units = {config.camera: recorded.depth_units[name]} if recorded and name in recorded.depth_units else {}
             config.calibration = plain_calibration(Calibration({config.camera: camera}, depth_units=units))
+        elif name != config.camera:
+            config.calibration = {}
 
 
 def _fixed_camera(meta: Any, name: str) -> Camera | None:

@@ -6,6 +6,7 @@ group: the centre crop, the drawn gripper, the lifting of pixels to points.
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 
 import torch
@@ -23,6 +24,8 @@ from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
 
+logger = logging.getLogger(__name__)
+
 
 class SceneInput(ABC):
     """Forms a network's input from preprocessed observations.
@@ -34,13 +37,38 @@ class SceneInput(ABC):
 
     def __init__(self, config: SymviewConfig, workspace: Workspace):
         self.config, self.workspace = config, workspace
-        calibration = parse_calibration(config.calibration) if config.calibration else None
+        calibration = parse_calibration(config.camera_calibration) if config.camera_calibration else None
         self._fixed_camera = calibration.camera(config.camera) if calibration else None
+        self._substitutes: set[str] = set()
 
     @property
     @abstractmethod
     def keys(self) -> list[str]:
         """Features of a preprocessed observation that it reads."""
+
+    def own_names(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return observations with the names of the policy's camera, where those of another were not all renamed.
+
+        Raises:
+            KeyError: if the observations lack a feature of the camera.
+        """
+        calibration = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
+        optional = [keys.STATE] + (calibration if self._fixed_camera is not None else [])
+        needed = [key for key in self.keys if key not in optional]
+        missing = [key for key in needed if key not in batch]
+        if not missing:
+            return batch
+        camera = self.config.seen_camera
+        others = keys.substitutes(batch, camera, needed)
+        if len(others) != 1:
+            raise KeyError(
+                f"the policy needs {missing}, the observation has {sorted(batch)}: name its camera with "
+                "--policy.camera, or rename its image with --rename_map"
+            )
+        if others[0] not in self._substitutes:
+            self._substitutes.add(others[0])
+            logger.info("the camera %r takes the place of %r", others[0], camera)
+        return keys.as_camera(batch, camera, others[0], [*needed, *calibration])
 
     @abstractmethod
     def form(
@@ -80,8 +108,7 @@ class SceneInput(ABC):
         names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
         if all(name in batch for name in names):
             return batch[names[0]], batch[names[1]]
-        if self._fixed_camera is None:
-            raise KeyError(f"the method {self.config.method!r} needs {names}, the observation has {sorted(batch)}")
+        assert self._fixed_camera is not None  # `own_names` has checked it
         state, camera = batch[keys.STATE], self._fixed_camera
         k, pose = (
             torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
