@@ -93,15 +93,12 @@ def record_with_calibration_file(folder, distance):
 
 @pytest.fixture(scope="module")
 def poses(recordings):
-    """Kind -> (recording, episode) -> pose of the camera in the episode's first frame."""
-    return {
-        kind: [first_poses(folder, CAMERAS[kind]) for folder in folders]
-        for kind, folders in recordings.items()
-        if kind != "viewed"
-    } | {"viewed": [first_poses(folder, "side") for folder in recordings["recorded"]]}
+    """Kind -> recording -> pose of the camera in the first frame of every episode."""
+    return {kind: [first_poses(folder, CAMERAS[kind]) for folder in folders] for kind, folders in recordings.items()}
 
 
 def first_poses(folder, camera):
+    """Pose of the camera in the first frame of every episode."""
     source = SourceDataset(folder)
     key = keys.world_from_cam(camera)
     tables = [EpisodeTables(source, source.data_file(i), [key]).read(i) for i in range(len(source.episodes))]
