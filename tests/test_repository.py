@@ -77,8 +77,9 @@ ALLOWED_IMPORTS = {
     "lerobot_policy_symview.symmetry": set(),
     "lerobot_policy_symview.encoders": set(),
     "lerobot_policy_symview.configuration": {"encoders", "inputs.feature_contract", "methods", "symmetry"},
-    "lerobot_policy_symview.inputs": {"configuration", "symmetry"},
-    "lerobot_policy_symview.nn": {"configuration", "encoders", "inputs", "symmetry"},
+    "lerobot_policy_symview.tracing": set(),
+    "lerobot_policy_symview.inputs": {"configuration", "symmetry", "tracing"},
+    "lerobot_policy_symview.nn": {"configuration", "encoders", "inputs", "symmetry", "tracing"},
 }
 """Package -> the packages it may import; subpackage -> the subpackages of its own package. There are no cycles."""
 FORBIDDEN = {"lerobot_symview.geometry": {"lerobot", "draccus"}, "lerobot_symview.views": {"lerobot", "draccus"}}

@@ -32,6 +32,7 @@ from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_t
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.errors import DivergenceError
@@ -179,13 +180,14 @@ class SymviewPolicy(PreTrainedPolicy):
         """Return the action (B, A) for observations (B, ...).
 
         Raises:
-            DivergenceError: if it is not finite.
+            DivergenceError: if it is not finite; an exported policy does not check it.
         """
         self.eval()
         with self.precision():
             scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
         action = self.physical(scaled)
-        self.check_action(action, batch)
+        if not is_exporting():  # an exported program has no branches on values
+            self.check_action(action, batch)
         return action
 
     def check_action(self, action: Tensor, batch: dict[str, Tensor]) -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview.geometry.workspace import Workspace
 
 POINTS = 1024  # points per scene that the point-cloud encoder gets
@@ -37,7 +38,12 @@ class Cloud:
 
         Without `shuffle` the sampling order is fixed for each image size. A scene with fewer valid points repeats them;
         a scene without any gives zeros.
+
+        Raises:
+            NotImplementedError: if the sampling is to be exported.
         """
+        if is_exporting():  # a trace would draw other points in every call
+            raise NotImplementedError("the point-cloud encoder cannot be exported or traced: its points are sampled")
         if shuffle:
             rank = torch.rand(self.valid.shape, device=self.valid.device)
         else:

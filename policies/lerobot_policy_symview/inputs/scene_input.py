@@ -111,7 +111,7 @@ class SceneInput(ABC):
         assert self._fixed_camera is not None  # `own_names` has checked it
         state, camera = batch[keys.STATE], self._fixed_camera
         k, pose = (
-            torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(len(state), -1)
+            torch.as_tensor(matrix, dtype=state.dtype, device=state.device).flatten().expand(state.shape[0], -1)
             for matrix in (camera.intrinsics, camera.world_from_cam)
         )
         return k, pose
@@ -120,14 +120,18 @@ class SceneInput(ABC):
 class ImageInput(SceneInput):
     """Images (B, C, crop, crop): colour in [0, 1], height for `rgbd`, the drawn gripper for `gripper_input=image`."""
 
+    def __init__(self, config: SymviewConfig, workspace: Workspace):
+        super().__init__(config, workspace)
+        self._color_key, self._height_key = config.color_key, config.height_key  # once: height_key makes the view
+
     @property
     def keys(self) -> list[str]:
         """The view's colour and height, the state, and the camera's calibration where it is used."""
         config = self.config
-        features = [config.color_key, keys.STATE]
+        features = [self._color_key, keys.STATE]
         if config.modality == "rgbd":
-            assert config.height_key is not None
-            features.append(config.height_key)
+            assert self._height_key is not None
+            features.append(self._height_key)
         if config.camera_direction:
             features += [keys.intrinsics(config.camera), keys.world_from_cam(config.camera)]
         if config.view.name == "top" and config.modality == "rgbd":
@@ -156,11 +160,11 @@ class ImageInput(SceneInput):
 
     def _images(self, batch: dict[str, Tensor]) -> Tensor:
         """Colour in [0, 1] and, for `rgbd`, height relative to the working volume (a side camera's depth in metres)."""
-        color = batch[self.config.color_key]
+        color = batch[self._color_key]
         if self.config.modality == "rgb":
             return self.downscale(color)
-        assert self.config.height_key is not None
-        height = batch[self.config.height_key]
+        assert self._height_key is not None
+        height = batch[self._height_key]
         if self.config.view.name == "top":  # from straight above, depth is the camera's height less the surface's
             camera_height = batch[keys.world_from_cam("top")].reshape(-1, 4, 4)[:, 2, 3]
             height = camera_height[:, None, None, None] - height
@@ -197,7 +201,7 @@ class PointInput(SceneInput):
         """Return voxels (B, 4, Z, X, Y) or points (B, P, 6) and states (B, N); points are not cropped."""
         camera, clipping = self.config.camera, ReprojectedView()
         state, dimensions = batch[keys.STATE], self.config.state_symmetry
-        z = state[:, dimensions.index("z")] if "z" in dimensions else state.new_full((len(state),), torch.inf)
+        z = state[:, dimensions.index("z")] if "z" in dimensions else state.new_full(state.shape[:1], torch.inf)
         cloud = cloud_from_depth(
             batch[keys.rgb(camera)],
             batch[keys.depth(camera)],

@@ -24,11 +24,11 @@ def voxelize(cloud: Cloud, workspace: Workspace) -> Tensor:
     layer = torch.floor(cloud.position[..., 2] / edge + 0.5).long()
     inside = cloud.valid & (layer >= 0) & (layer < HEIGHT)
     inside &= ((column >= 0) & (column < SIDE)).all(-1)
-    batch = torch.arange(len(layer), device=layer.device)[:, None]
+    batch = torch.arange(layer.shape[0], device=layer.device)[:, None]
     voxel = ((batch * HEIGHT + layer) * SIDE + column[..., 0]) * SIDE + column[..., 1]
-    count = len(layer) * HEIGHT * SIDE * SIDE
+    count = layer.shape[0] * HEIGHT * SIDE * SIDE
     voxel = torch.where(inside, voxel, count)  # an extra voxel collects the points outside the grid
     values = torch.cat([torch.ones_like(cloud.color[..., :1]), cloud.color], dim=-1).flatten(0, 1)
     sums = values.new_zeros(count + 1, VOXEL_CHANNELS).index_add_(0, voxel.flatten(), values)[:-1]
-    grid = (sums / sums[:, :1].clamp(min=1)).view(len(layer), HEIGHT, SIDE, SIDE, VOXEL_CHANNELS)
+    grid = (sums / sums[:, :1].clamp(min=1)).view(layer.shape[0], HEIGHT, SIDE, SIDE, VOXEL_CHANNELS)
     return grid.permute(0, 4, 1, 2, 3).contiguous()

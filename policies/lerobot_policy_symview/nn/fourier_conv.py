@@ -22,6 +22,7 @@ from lerobot_policy_symview.nn.fourier_kernels import ORDER, PIXELS, PLANE, STRI
 from lerobot_policy_symview.nn.layers import FieldConv2d, steerable_basis
 from lerobot_policy_symview.nn.threads import in_threads
 from lerobot_policy_symview.symmetry.groups import DECIMALS, PlanarGroup, make_group
+from lerobot_policy_symview.tracing import is_exporting
 
 FUNCTIONS = 6  # of the steerable basis
 DIM1_ROWS, DIM2_ROWS = {ORDER: 6, 1: 4}, {ORDER: 12, 1: 1}  # per irrep, of a regular field and of a scalar
@@ -229,8 +230,9 @@ class FourierConv2d(FieldConv2d):
     def plan(self, images: Tensor, pool: bool) -> Plan | None:
         """Return the plan of the computation in irreps, or None where the layer falls back to the dense convolution."""
         is_cpu = images.device.type == self.weight.device.type == "cpu" and images.dtype == self.weight.dtype
-        is_eager = images.dtype in (torch.float32, torch.float64) and not torch.compiler.is_compiling()
-        if not (is_cpu and is_eager) or not self._elements or torch.is_autocast_enabled("cpu") or images.ndim != 4:
+        is_eager = not (torch.compiler.is_compiling() or is_exporting() or torch.is_autocast_enabled("cpu"))
+        is_float = images.dtype in (torch.float32, torch.float64)
+        if not (is_cpu and is_eager and is_float) or not self._elements or images.ndim != 4:
             return None
         if self._elements == 1 and images.requires_grad and torch.is_grad_enabled():
             return None

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_policy_symview.symmetry.groups import DECIMALS, PlanarGroup
+from lerobot_policy_symview.tracing import is_exporting
 
 RING_WIDTH = 0.4  # pixels; as in escnn's 3 x 3 filters, so that both span the same functions
 FREQUENCIES = 2  # highest angular frequency of the ring; 3 x 3 pixels hold no more without aliasing
@@ -113,8 +114,10 @@ class FieldLayer(nn.Module):
         """Return `compute()`, a function of the weights; without gradients the result is cached until they change.
 
         PyTorch counts no version for changes through `parameter.data`: they take effect after the next switch between
-        `train()` and `eval()`.
+        `train()` and `eval()`. An export records `compute()` and caches nothing.
         """
+        if is_exporting():
+            return compute()
         if torch.is_grad_enabled():
             self._cache = None
             return compute()

@@ -23,4 +23,4 @@ class Encoder(nn.Module):
 
     def split(self, channels: Tensor) -> Tensor:
         """Split channels (B, G n, ...) of a single pixel into regular fields (B, G, n)."""
-        return channels.reshape(len(channels), self.group.size, self.fields)
+        return channels.reshape(channels.shape[0], self.group.size, self.fields)

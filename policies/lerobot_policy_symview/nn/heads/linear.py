@@ -27,8 +27,8 @@ class EquivariantLinear(nn.Module):
         matrices = torch.tensor(representation, dtype=torch.get_default_dtype())
         self.register_buffer("representation", matrices, persistent=False)
         # a bias must be invariant, so only the dimensions that rho leaves unchanged have one
-        unchanged = (matrices == torch.eye(dimensions, dtype=matrices.dtype)).all(dim=0).all(dim=1)
-        self.register_buffer("invariant", unchanged.nonzero()[:, 0], persistent=False)
+        units = torch.eye(dimensions, dtype=matrices.dtype)
+        self.register_buffer("invariant", units[(matrices == units).all(dim=0).all(dim=1)], persistent=False)
         self.weight = nn.Parameter(torch.empty(dimensions, fields))
         nn.init.normal_(self.weight, std=1 / math.sqrt(group_size * fields))
         self.bias = nn.Parameter(torch.zeros(len(self.invariant)))
@@ -37,5 +37,5 @@ class EquivariantLinear(nn.Module):
         """Map features (B, G, n) to (B, A), in the weights' precision even under autocast."""
         with torch.autocast(features.device.type, enabled=False):
             values = functional.linear(features.to(self.weight.dtype), self.weight)
-            output = torch.einsum("gab,xgb->xa", self.representation, values)
-            return output.index_add(1, self.invariant, self.bias.expand(len(output), -1))
+            # not index_add, whose ONNX export overwrites the output instead where every dimension has a bias
+            return torch.einsum("gab,xgb->xa", self.representation, values) + self.bias @ self.invariant

@@ -1,0 +1,119 @@
+"""Exported and traced policies against the policies themselves."""
+
+import io
+
+import onnxruntime
+import pytest
+import torch
+
+from lerobot_policy_symview.equivariance import assert_equivariant, example_observation
+from lerobot_policy_symview.export import PolicyModule, export_onnx, export_policy
+from lerobot_symview import keys
+from tests.helpers.policies import make_actor, make_policy
+
+POLICIES = {
+    "equivariant": lambda: make_policy(weight_averaging=0.9),
+    "plain": lambda: make_actor(method="sideview_nonequi"),
+}
+FIXED_SIZE = pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning")  # of decisions by the images' size
+
+
+@pytest.fixture(params=POLICIES)
+def policy(request):
+    return with_biases(POLICIES[request.param]())
+
+
+def with_biases(policy):
+    """Give all biases, which are initialised with zeros, other values."""
+    for name, parameter in policy.named_parameters():
+        if name.endswith("bias"):
+            torch.nn.init.normal_(parameter, std=0.1)
+    return policy
+
+
+def inputs(policy, batch=2):
+    observation = example_observation(policy.config, batch=batch)
+    return {key: observation[key] for key in policy.scene.keys}
+
+
+def assert_same_policy(exported, policy, monkeypatch):
+    """Compare actions for batches of different size, and check the equivariance of the exported policy."""
+    for batch in (1, 2, 3):
+        observation = inputs(policy, batch)
+        torch.testing.assert_close(exported(observation), policy.select_action(observation), rtol=0, atol=1e-5)
+    if policy.config.group == "D4":
+        with monkeypatch.context() as patch:
+            patch.setattr(policy, "select_action", lambda batch: exported({key: batch[key] for key in observation}))
+            assert_equivariant(policy)
+
+
+def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
+    file = tmp_path / "policy.onnx"
+    export_onnx(policy, example_observation(policy.config), file)
+    assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]
+    session = onnxruntime.InferenceSession(file)
+    assert [feature.name for feature in session.get_inputs()] == policy.scene.keys
+    assert [output.name for output in session.get_outputs()] == ["action"]
+
+    def run(observation):
+        (action,) = session.run(None, {key: values.numpy() for key, values in observation.items()})
+        return torch.from_numpy(action)
+
+    assert_same_policy(run, policy, monkeypatch)
+
+
+@FIXED_SIZE
+def test_traced_policies_match_the_policy(policy, tmp_path, monkeypatch):
+    torch.jit.trace(PolicyModule(policy), (inputs(policy),)).save(tmp_path / "policy.pt")
+    assert_same_policy(torch.jit.load(tmp_path / "policy.pt"), policy, monkeypatch)
+
+
+def test_exported_programs_match_the_policy(monkeypatch):
+    policy = with_biases(make_actor())
+    program = export_policy(policy, example_observation(policy.config, batch=1))
+    buffer = io.BytesIO()
+    torch.export.save(program, buffer)
+    buffer.seek(0)
+    assert_same_policy(torch.export.load(buffer).module(), policy, monkeypatch)
+
+
+def test_strictly_exported_programs_match_the_policy(monkeypatch):
+    policy = with_biases(make_policy())
+    module, example = PolicyModule(policy), inputs(policy)
+    sizes = {key: {0: torch.export.Dim("batch")} for key in example}
+    program = torch.export.export(module, (example,), dynamic_shapes=(sizes,), strict=True)
+    assert_same_policy(program.module(), policy, monkeypatch)
+
+
+def test_a_configured_calibration_is_part_of_the_program():
+    observation = example_observation(make_policy(method="persp_equi_broken").config)
+    names = keys.intrinsics("side"), keys.world_from_cam("side")
+    k, pose = (observation.pop(name)[0] for name in names)
+    side = {
+        "width": 640,
+        "height": 480,
+        "intrinsics": k.view(3, 3).tolist(),
+        "world_from_cam": pose.view(4, 4).tolist(),
+    }
+    policy = make_policy(method="persp_equi_broken", calibration={"units": "m", "cameras": {"side": side}})
+    program = export_policy(policy, observation)
+    (example,), _ = program.example_inputs
+    assert not set(names) & set(example)
+    torch.testing.assert_close(program.module()(example), policy.select_action(example), rtol=0, atol=1e-5)
+
+
+@pytest.mark.long
+@FIXED_SIZE
+def test_policies_with_the_voxel_encoder_are_exported_and_traced(monkeypatch):
+    policy = with_biases(make_policy(method="voxel_equi"))
+    traced = torch.jit.trace(PolicyModule(policy), (inputs(policy),))
+    for exported in (traced, export_policy(policy, inputs(policy)).module()):
+        assert_same_policy(exported, policy, monkeypatch)
+
+
+def test_policies_with_the_point_cloud_encoder_are_not_exported():
+    policy = make_policy(method="point_cloud_equi")
+    with pytest.raises(NotImplementedError, match="point-cloud encoder"):
+        export_policy(policy, inputs(policy))
+    with pytest.raises(NotImplementedError, match="point-cloud encoder"):
+        torch.jit.trace(PolicyModule(policy), (inputs(policy),))
