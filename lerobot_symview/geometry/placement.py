@@ -131,7 +131,7 @@ class CameraSpec:
             camera = self._camera(workspace, rng)
         angles = "raise its distance or fov_deg, point it at the workspace, or lower its spread"
         remedy = angles if self.world_from_cam is None else ""
-        check_camera(self.name, camera, workspace, remedy, minimum_visible)
+        check_camera(self.name, camera, workspace, remedy, minimum_visible, pixels=0.0)
         return camera
 
     def _camera(self, workspace: Workspace, rng: np.random.Generator | None) -> Camera:

@@ -35,7 +35,12 @@ def check_above_table(camera: Camera) -> None:
 
 
 def check_camera(
-    name: str, camera: Camera, workspace: Workspace, remedy: str = "", minimum: float = MINIMUM_VISIBLE
+    name: str,
+    camera: Camera,
+    workspace: Workspace,
+    remedy: str = "",
+    minimum: float = MINIMUM_VISIBLE,
+    pixels: float = MINIMUM_PIXELS,
 ) -> None:
     """Raise an error unless a camera above the table shows enough of the workspace in enough pixels.
 
@@ -45,11 +50,12 @@ def check_camera(
         workspace: the working volume.
         remedy: end of the message; by default the other readings of the pose with which the camera would be sound.
         minimum: fraction of the working volume that must be in the image.
+        pixels: side of the workspace in the image that is needed, `workspace_pixels`.
 
     Raises:
         CalibrationError: if the camera is below the table, sees too little of the workspace, or is too far away.
     """
-    problem = camera_problem(camera, workspace, minimum)
+    problem = camera_problem(camera, workspace, minimum, pixels)
     if problem is not None:
         raise CalibrationError(f"camera {name!r} {problem}: {remedy or _causes(camera, workspace, minimum)}")
 
@@ -61,17 +67,19 @@ def _causes(camera: Camera, workspace: Workspace, minimum: float) -> str:
     return "; ".join(causes)
 
 
-def camera_problem(camera: Camera, workspace: Workspace, minimum: float = MINIMUM_VISIBLE) -> str | None:
-    """Return what is wrong with a camera's view of the workspace; None if nothing is."""
+def camera_problem(
+    camera: Camera, workspace: Workspace, minimum: float = MINIMUM_VISIBLE, pixels: float = MINIMUM_PIXELS
+) -> str | None:
+    """Return what is wrong with a camera that must see the workspace, as `check_camera` says; None if nothing is."""
     if not camera.position[2] > 0:
         return f"is below the table, at z = {camera.position[2]:.3g} m"
     visible = workspace.visible_fraction(camera)
     if visible < minimum:
         return f"sees {visible:.0%} of the workspace, expected at least {minimum:.0%}"
-    pixels = workspace_pixels(camera, workspace)
-    if pixels < MINIMUM_PIXELS:
+    side = workspace_pixels(camera, workspace)
+    if side < pixels:
         return (
-            f"shows the workspace in {pixels:.2g} x {pixels:.2g} pixels, expected at least {MINIMUM_PIXELS:.0f}; "
+            f"shows the workspace in {side:.2g} x {side:.2g} pixels, expected at least {pixels:.0f}; "
             f"it is {np.linalg.norm(camera.position - [*workspace.center, 0]):.3g} m away"
         )
     return None

@@ -58,7 +58,7 @@ def test_requested_views_are_computed_and_shown_with_the_stored_ones(with_views,
 
 def test_a_given_workspace_is_shown_and_measured(recorded, with_views, tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="symview_eval.preview"):
-        preview(config(recorded, tmp_path / "elsewhere", frames=1, workspace=Workspace((0.45, 0.6))))
+        preview(config(recorded, tmp_path / "elsewhere", frames=1, workspace=Workspace((0.45, 0.3))))
     assert "of the workspace, less than 60%: move or rotate the camera" in caplog.text
     smaller = config(with_views, tmp_path / "smaller", frames=1, workspace=Workspace(size=0.3))
     assert "<figcaption>side_reproj, computed</figcaption>" in (preview(smaller) / "preview.html").read_text()

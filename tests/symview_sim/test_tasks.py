@@ -8,6 +8,7 @@ import gymnasium
 import pytest
 
 from lerobot_symview import registry
+from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim import TASK_NAMES, gym_id
 from symview_sim.settings import EnvSettings
@@ -62,7 +63,7 @@ def test_gymnasium_makes_a_registered_task(wide_picking):
 
 
 def test_a_registered_name_is_suggested_and_cannot_be_taken_twice(wide_picking):
-    with pytest.raises(ValueError, match="did you mean 'wide_picking'"):
+    with pytest.raises(OptionError, match="did you mean 'wide_picking'"):
         EnvSettings("wide_piking")
     with pytest.raises(ValueError, match="a task named 'wide_picking' is already registered"):
         register_task("wide_picking")

@@ -254,7 +254,7 @@ def test_depth_in_float_millimetres_gives_the_same_views(recorded, tmp_path, dec
     rewrite_depth(source, key, lambda depth: depth * np.float32(1000))
     change_feature(source, key, info={"is_depth_map": True} | ({"depth_unit": "mm"} if declared else {}))
     result = add_views(views_config(source, tmp_path / "views", views=["reproj"]))
-    assert (f"{key} declares no depth_unit: its values are taken to be millimetres" in caplog.text) != declared
+    assert (f"{key} declares no depth_unit: the table at z = 0 shows millimetres" in caplog.text) != declared
     view = keys.view("side", "reproj_height")
     expected = add_views(views_config(recorded, tmp_path / "expected", views=["reproj"]))
     np.testing.assert_allclose(images_of(result, view), images_of(expected, view), atol=1e-5)
