@@ -115,7 +115,7 @@ class SymviewPolicy(PreTrainedPolicy):
         changed = changed_options(policy.config, saved) if saved is not None else []
         if changed:
             logger.info(
-                "the preprocessing of %s is replaced: views are made from the camera %r, with another %s",
+                "the preprocessing of %s is made anew for the camera %r (changed: %s)",
                 pretrained_name_or_path,
                 policy.config.seen_camera,
                 ", ".join(changed),

@@ -73,9 +73,9 @@ def check(tuned, camera, raw, views):
 @pytest.mark.parametrize(
     ("flags", "camera", "line"),
     [
-        ([CAMERA], "front", "is replaced: views are made from the camera 'front', with another camera, calibration"),
+        ([CAMERA], "front", "is made anew for the camera 'front' (changed: camera, calibration)"),
         ([RENAME], "side", "no images of the camera 'side': those of 'front' take their place, if --rename_map"),
-        ([CAMERA, RENAME], "front", "is replaced: views are made from the camera 'front'"),
+        ([CAMERA, RENAME], "front", "is made anew for the camera 'front'"),
     ],
     ids=["camera", "rename", "both"],
 )
