@@ -35,6 +35,7 @@ def test_the_env_benchmark_names_every_time(monkeypatch, capsys):
         "episodes_per_s",
         "saved_episodes_per_s",
     ]
+    results.pop("other_ms")  # a difference of medians, which a busy machine can make negative
     assert all(value > 0 for value in results.values())
 
 
