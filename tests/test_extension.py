@@ -10,6 +10,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot_symview import registry
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.errors import OptionError
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.helpers.packages import install
@@ -92,5 +93,5 @@ def test_task_view_and_encoder_of_another_package_work_end_to_end(tmp_path, monk
 
 @pytest.mark.usefixtures("other_package")
 def test_names_of_another_package_are_suggested():
-    with pytest.raises(ValueError, match="did you mean 'easy_picking'"):
+    with pytest.raises(OptionError, match="did you mean 'easy_picking'"):
         RecordedEnv(task="easy_piking")
