@@ -44,9 +44,6 @@ def export_policy(policy: SymviewPolicy, observation: dict[str, Tensor]) -> torc
 
     Returns:
         The program of a `PolicyModule`; `example_inputs` has the features that it reads.
-
-    Raises:
-        NotImplementedError: if the policy's encoder is `point_cloud`.
     """
     # two samples, since torch.export takes a size of 1 for a constant
     example = {key: torch.cat([observation[key][:1]] * 2) for key in policy.scene.keys if key in observation}
@@ -60,7 +57,7 @@ def export_onnx(policy: SymviewPolicy, observation: dict[str, Tensor], file: str
     The model's inputs are named after the features that the policy reads, its output is `action`.
 
     Args:
-        policy: as for `export_policy`, with any encoder of images.
+        policy: as for `export_policy`. The graph of the encoder `point_cloud` is too large for the exporter.
         observation: as for `export_policy`.
         file: is overwritten.
     """

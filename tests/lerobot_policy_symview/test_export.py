@@ -8,6 +8,7 @@ import torch
 
 from lerobot_policy_symview.equivariance import assert_equivariant, example_observation
 from lerobot_policy_symview.export import PolicyModule, export_onnx, export_policy
+from lerobot_policy_symview.nn.encoders.point_cloud import SetAbstraction
 from lerobot_symview import keys
 from tests.helpers.policies import make_actor, make_policy
 
@@ -47,10 +48,11 @@ def assert_same_policy(exported, policy, monkeypatch):
             assert_equivariant(policy)
 
 
-def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
-    file = tmp_path / "policy.onnx"
+def onnx_policy(policy, folder):
+    """The policy as a function that runs its ONNX model."""
+    file = folder / "policy.onnx"
     export_onnx(policy, example_observation(policy.config), file)
-    assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]
+    assert [path.name for path in folder.iterdir()] == ["policy.onnx"]
     session = onnxruntime.InferenceSession(file)
     assert [feature.name for feature in session.get_inputs()] == policy.scene.keys
     assert [output.name for output in session.get_outputs()] == ["action"]
@@ -59,7 +61,11 @@ def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
         (action,) = session.run(None, {key: values.numpy() for key, values in observation.items()})
         return torch.from_numpy(action)
 
-    assert_same_policy(run, policy, monkeypatch)
+    return run
+
+
+def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
+    assert_same_policy(onnx_policy(policy, tmp_path), policy, monkeypatch)
 
 
 @FIXED_SIZE
@@ -104,16 +110,19 @@ def test_a_configured_calibration_is_part_of_the_program():
 
 @pytest.mark.long
 @FIXED_SIZE
-def test_policies_with_the_voxel_encoder_are_exported_and_traced(monkeypatch):
-    policy = with_biases(make_policy(method="voxel_equi"))
+@pytest.mark.parametrize("method", ["voxel_equi", "point_cloud_equi"])
+def test_policies_on_points_are_exported_and_traced(method, monkeypatch):
+    policy = with_biases(make_policy(method=method))
+    for module in policy.modules():
+        if isinstance(module, SetAbstraction):
+            module.centers = 17  # each is an iteration, which an export unrolls
     traced = torch.jit.trace(PolicyModule(policy), (inputs(policy),))
-    for exported in (traced, export_policy(policy, inputs(policy)).module()):
-        assert_same_policy(exported, policy, monkeypatch)
+    exported = export_policy(policy, inputs(policy)).module()
+    for again in (traced, exported):
+        assert_same_policy(again, policy, monkeypatch)
 
 
-def test_policies_with_the_point_cloud_encoder_are_not_exported():
-    policy = make_policy(method="point_cloud_equi")
-    with pytest.raises(NotImplementedError, match="point-cloud encoder"):
-        export_policy(policy, inputs(policy))
-    with pytest.raises(NotImplementedError, match="point-cloud encoder"):
-        torch.jit.trace(PolicyModule(policy), (inputs(policy),))
+@pytest.mark.long
+def test_onnx_models_of_voxels_match_the_policy(tmp_path, monkeypatch):
+    policy = with_biases(make_policy(method="voxel_equi"))
+    assert_same_policy(onnx_policy(policy, tmp_path), policy, monkeypatch)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview.geometry.workspace import Workspace
 
 POINTS = 1024  # points per scene that the point-cloud encoder gets
@@ -38,16 +38,11 @@ class Cloud:
 
         Without `shuffle` the sampling order is fixed for each image size. A scene with fewer valid points repeats them;
         a scene without any gives zeros.
-
-        Raises:
-            NotImplementedError: if the sampling is to be exported.
         """
-        if is_exporting():  # a trace would draw other points in every call
-            raise NotImplementedError("the point-cloud encoder cannot be exported or traced: its points are sampled")
         if shuffle:
             rank = torch.rand(self.valid.shape, device=self.valid.device)
         else:
-            rank = torch.rand(self.valid.shape[1], generator=torch.Generator().manual_seed(0)).to(self.valid.device)
+            rank = fixed_ranks(self.valid.shape[1]).to(self.valid.device)
         distinct = min(count, self.valid.shape[1])
         order = torch.where(self.valid, rank, 2.0).topk(distinct, dim=1, largest=False).indices
         available = self.valid.sum(dim=1, keepdim=True).clamp(min=1)
@@ -55,6 +50,16 @@ class Cloud:
         points = torch.cat([self.position.to(self.color.dtype), self.color], dim=-1)
         points = points.gather(1, chosen[..., None].expand(-1, -1, points.shape[-1]))
         return points * self.valid.any(dim=1)[:, None, None]
+
+
+@torch.compiler.assume_constant_result
+def fixed_ranks(count: int) -> Tensor:
+    """Return `count` distinct ranks in [0, 1), always the same; (count,) float32.
+
+    They are drawn by NumPy, so that an exported or traced policy has them as a constant. A trace would record a random
+    operation of torch without its generator, and sample other points in every call.
+    """
+    return torch.from_numpy(np.random.default_rng(0).random(count, dtype=np.float32))
 
 
 def cloud_from_depth(
@@ -73,10 +78,10 @@ def cloud_from_depth(
     batch, _, height, width = depth.shape
     distance = depth[:, 0].double()
     k, pose = intrinsics.double().view(batch, 3, 3), world_from_cam.double().view(batch, 4, 4)
-    v = torch.arange(height, dtype=torch.float64, device=depth.device)[:, None].expand(height, width)
-    u = torch.arange(width, dtype=torch.float64, device=depth.device)[None].expand(height, width)
-    pixel = torch.stack([u, v, torch.ones_like(u)], dim=-1).view(-1, 3)
-    rays = pixel @ torch.linalg.inv_ex(k).inverse.transpose(1, 2) @ pose[:, :3, :3].transpose(1, 2)
+    v = torch.arange(height, dtype=torch.float64, device=depth.device)[:, None].expand(height, width).flatten()
+    u = torch.arange(width, dtype=torch.float64, device=depth.device)[None].expand(height, width).flatten()
+    x_over_z, y_over_z = (u - k[:, 0, 2:]) / k[:, 0, :1], (v - k[:, 1, 2:]) / k[:, 1, 1:2]
+    rays = torch.stack([x_over_z, y_over_z, torch.ones_like(x_over_z)], dim=-1) @ pose[:, :3, :3].transpose(1, 2)
     world = rays * distance.view(batch, -1, 1) + pose[:, None, :3, 3]
     x, y, z = world.unbind(-1)
     position = torch.stack([x - workspace.center[0], y - workspace.center[1], z], dim=-1)

@@ -16,7 +16,6 @@ from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
 
-POINTS = 1024  # per cloud
 UNIT = 0.1  # metres; coordinates are divided by it, so that they are of the order of one
 
 
@@ -114,7 +113,7 @@ class SetAbstraction(nn.Module):
 
 def farthest_points(position: Tensor, count: int) -> Tensor:
     """Return the indices (B, count) of a farthest point sample of points (B, P, 3) that starts at the first point."""
-    chosen = [torch.zeros(len(position), dtype=torch.long, device=position.device)]
+    chosen = [torch.zeros(position.shape[0], dtype=torch.long, device=position.device)]
     nearest = position.new_full(position.shape[:2], torch.inf)
     for _ in range(count - 1):
         last = _gather(position, chosen[-1][:, None])
