@@ -14,32 +14,32 @@ ORACLE = "top"  # the simulator's camera straight above the table
 
 def rgb(camera: str) -> str:
     """uint8 (H, W, 3) colour image of `camera`."""
-    return f"observation.images.{camera}"
+    return f"{IMAGES}{camera}"
 
 
 def depth(camera: str) -> str:
     """float32 (H, W, 1) depth along the optical axis, metres, 0 = invalid."""
-    return f"observation.images.{camera}_depth"
+    return f"{IMAGES}{camera}_depth"
 
 
 def segmentation(camera: str) -> str:
     """uint8 (H, W, 3) segmentation label, repeated in the three channels: 0 table, 1 robot, 2 and up objects."""
-    return f"observation.images.{camera}_segmentation"
+    return f"{IMAGES}{camera}_segmentation"
 
 
 def intrinsics(camera: str) -> str:
     """float32 (9,) 3 x 3 intrinsic matrix K in pixels, row-major."""
-    return f"observation.camera.{camera}.intrinsics"
+    return f"{CALIBRATIONS}{camera}.intrinsics"
 
 
 def world_from_cam(camera: str) -> str:
     """float32 (16,) 4 x 4 camera-to-world transform, row-major, metres."""
-    return f"observation.camera.{camera}.world_from_cam"
+    return f"{CALIBRATIONS}{camera}.world_from_cam"
 
 
 def view(camera: str, output: str) -> str:
     """Output of a view rendered from `camera`; `output` is, for example, `reproj` or `reproj_height`."""
-    return f"observation.images.{camera}_{output}"
+    return f"{IMAGES}{camera}_{output}"
 
 
 def of_camera(key: str, camera: str, other: str) -> str:

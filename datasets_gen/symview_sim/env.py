@@ -186,7 +186,7 @@ def checked_action(action: ArrayLike) -> NDArray[np.float64]:
 def named_features(observation: EnvObservation) -> dict[str, NDArray[Any]]:
     """Return an observation under the keys of a LeRobot dataset. Depth (1, H, W) becomes (H, W, 1)."""
     features = {keys.STATE: observation["agent_pos"]}
-    features |= {f"observation.images.{name}": image for name, image in observation["pixels"].items()}
+    features |= {keys.rgb(name): image for name, image in observation["pixels"].items()}
     for key in observation.keys() - {"agent_pos", "pixels"}:
         value = observation[key]
         features[f"observation.{key}"] = value[0, ..., None] if value.ndim == 3 else value
@@ -200,7 +200,7 @@ def _env_key(key: str) -> str:
 
 def _camera_name(key: str) -> str:
     """Return the name under `pixels` that LeRobot maps to `key`, by prefixing `observation.images.`."""
-    return key.removeprefix("observation.images.")
+    return key.removeprefix(keys.IMAGES)
 
 
 def _observation_spaces(cameras: dict[str, Camera], settings: EnvSettings) -> dict[str, gymnasium.Space[Any]]:

@@ -115,7 +115,7 @@ def read_samples(
     samples = []
     for index in indices:
         row = table.slice(index, 1)
-        stored = {key.removeprefix(keys.rgb("")): next(source.images(key, episode, row)) for key in images}
+        stored = {key.removeprefix(keys.IMAGES): next(source.images(key, episode, row)) for key in images}
         samples.append(FrameSample(episode, index, next(reader.frames(episode, row)) if reader else None, stored))
     return samples
 
@@ -220,7 +220,7 @@ def _is_wanted(config: PreviewConfig, view: View, features: Features) -> bool:
 def _stored_views(features: Features) -> list[str]:
     """Return the names of the stored images that are views."""
     facts = {key: (feature.get("info") or {}).get("symview", {}) for key, feature in features.items()}
-    return [key.removeprefix(keys.rgb("")) for key, fact in facts.items() if "view" in fact]
+    return [key.removeprefix(keys.IMAGES) for key, fact in facts.items() if "view" in fact]
 
 
 def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDArray]:

@@ -87,9 +87,11 @@ def read_calibration(file: Path | str) -> Calibration:
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise CalibrationError(f"cannot read {file}: {error}") from None
     try:
-        return parse_calibration(content)
+        calibration = parse_calibration(content)
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from None
+    _warn_of_resized(calibration)
+    return calibration
 
 
 def parse_calibration(content: Any) -> Calibration:
@@ -171,8 +173,9 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
     missing = [entry for entry in REQUIRED if entry not in entries]
     if missing:
         problems.append(f"lacks {', '.join(missing)}")
-    if sum(pose in entries for pose in POSES) != 1:
-        problems.append(f"expected one of {', '.join(POSES)}, got {', '.join(set(POSES) & set(entries)) or 'none'}")
+    poses = [pose for pose in POSES if pose in entries]
+    if len(poses) != 1:
+        problems.append(f"expected one of {', '.join(POSES)}, got {', '.join(poses) or 'none'}")
     if ("position" in entries) != ("quaternion_xyzw" in entries):
         problems.append("position and quaternion_xyzw belong together")
     if np.any(entries.get("distortion") or 0):
@@ -183,24 +186,23 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
         if not isinstance(entries[side], int) or entries[side] < 1:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
-    _warn_of_resized(name, intrinsics, entries["height"], entries["width"])
     return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
 
 
-def _warn_of_resized(name: str, intrinsics: Array, height: int, width: int) -> None:
-    """Warn of a principal point far from the middle: K is often that of another image size, or never calibrated."""
-    for value, size in ((intrinsics[0, 2], width), (intrinsics[1, 2], height)):
-        if 0 <= value < size and abs(value - size / 2) > OFF_CENTER * size:
+def _warn_of_resized(calibration: Calibration) -> None:
+    """Warn of principal points far from the middle: K is often that of another image size, or never calibrated."""
+    for name, camera in calibration.cameras.items():
+        x, y = abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)
+        if max(x, y) > OFF_CENTER:
             logger.warning(
                 "camera %r: the principal point (%.4g, %.4g) is far from the middle of the %d x %d image: "
                 "are the intrinsics those of another image size?",
                 name,
-                intrinsics[0, 2],
-                intrinsics[1, 2],
-                width,
-                height,
+                camera.cx,
+                camera.cy,
+                camera.width,
+                camera.height,
             )
-            return
 
 
 def _intrinsics(value: Any) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera
-from lerobot_symview.geometry.units import unit_name
+from lerobot_symview.geometry.units import METRES, unit_name
 from lerobot_symview.geometry.visibility import camera_problem, read_differently
 from lerobot_symview.geometry.workspace import Workspace
 
@@ -90,7 +90,7 @@ def has_depth(depth: NDArray, camera: Camera, workspace: Workspace) -> bool:
 
 
 def check_table(
-    depth: NDArray[np.floating], camera: Camera, workspace: Workspace, unit: float | None = None
+    depth: NDArray[np.floating], camera: Camera, workspace: Workspace, unit: float = METRES
 ) -> TablePlane | None:
     """Raise an error if a depth image shows the table elsewhere than the calibration says.
 
@@ -100,14 +100,15 @@ def check_table(
         depth: (H, W) float, metres; 0, negative or non-finite = invalid.
         camera: its calibration.
         workspace: the square on the table.
-        unit: metres per unit that `depth` had before it was converted, named in the message.
+        unit: metres per unit of the stored depth, from which it was converted; named in the message.
 
     Returns:
         The table's plane, where it is visible.
 
     Raises:
-        CalibrationError: if the camera does not show the workspace, or most of its pixels lie on a plane higher or
-            lower than 3 cm or tilted by more than 5 degrees, or below the table; the message names the likely cause.
+        CalibrationError: if most pixels of the workspace lie on a plane that is more than 3 cm from z = 0 or tilted by
+            more than 5 degrees, or lie below the table, or if none lies on the table but they would in another unit;
+            the message names the likely cause.
     """
     rays = _rays(depth, camera, workspace)
     if len(rays.depth) < max(3, FEW * rays.count):
@@ -124,8 +125,8 @@ def check_table(
             f"{below:.0%} of the depth pixels in the workspace lie below the table: "
             f"{_cause(depth, camera, workspace, rays, unit)}"
         )
-    if on_table < FEW and (scale := _better_scale(rays, unit)) is not None:
-        raise CalibrationError(f"no depth pixel lies on the table: {_unit_cause(scale, unit)}")
+    if on_table < FEW and (other := _other_unit(rays, unit)) is not None:
+        raise CalibrationError(f"no depth pixel lies on the table: {_unit_cause(other, unit)}")
     return plane
 
 
@@ -164,28 +165,23 @@ def _largest_plane(rays: _Rays, camera: Camera, workspace: Workspace) -> TablePl
     return TablePlane(float(c), float(np.rad2deg(np.arctan(np.hypot(a, b)))), float(best.mean()))
 
 
-def _cause(depth: NDArray, camera: Camera, workspace: Workspace, rays: _Rays, unit: float | None) -> str:
+def _cause(depth: NDArray, camera: Camera, workspace: Workspace, rays: _Rays, unit: float) -> str:
     """Return the likely cause: another unit, another reading of the pose, or the pose itself."""
-    scale = _better_scale(rays, unit)
-    if scale is not None:
-        return _unit_cause(scale, unit)
-    for name, other in read_differently(camera).items():
+    other_unit = _other_unit(rays, unit)
+    if other_unit is not None:
+        return _unit_cause(other_unit, unit)
+    for changes, other in read_differently(camera).items():
         if camera_problem(other, workspace) is None and _rays(depth, other, workspace).on_table(1.0) >= MOST:
-            return f"it would lie there with {name}"
+            return f"it would lie there with {' and '.join(changes)}"
     return "check the height and the rotation of the camera's pose, the table's height and the unit of depth"
 
 
-def _better_scale(rays: _Rays, unit: float | None) -> float | None:
-    """Return by which factor the depth must be multiplied to lie on the table, among the ratios of usual units."""
-    base = unit or 1.0
-    shares = {other / base: rays.on_table(other / base) for other in CAMERA_UNITS if other != base}
-    if unit is None:
-        shares = {a / b: rays.on_table(a / b) for a in CAMERA_UNITS for b in CAMERA_UNITS if a != b}
-    best = max(shares, key=lambda scale: shares[scale])
+def _other_unit(rays: _Rays, unit: float) -> float | None:
+    """Return the usual unit other than `unit` in which most of the stored depth lies on the table."""
+    shares = {other: rays.on_table(other / unit) for other in CAMERA_UNITS if other != unit}
+    best = max(shares, key=lambda other: shares[other])
     return best if shares[best] >= MOST else None
 
 
-def _unit_cause(scale: float, unit: float | None) -> str:
-    if unit is None:
-        return f"it would lie there if depth were multiplied by {scale:g}"
-    return f"it would lie there if depth were in {unit_name(scale * unit)}, not in {unit_name(unit)}"
+def _unit_cause(other: float, unit: float) -> str:
+    return f"it would lie there if depth were in {unit_name(other)}, not in {unit_name(unit)}"

@@ -176,7 +176,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     dropped = [
         key
         for key, feature in source.features.items()
-        if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.rgb("")) not in kept
+        if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.IMAGES) not in kept
     ]
     reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
     with flagged(f"--camera={config.camera}, --calibration"):
@@ -242,7 +242,7 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
     existing = [key for key in added if key in features]
     if existing:
         raise ValueError(f"the dataset already has {', '.join(existing)}: change --views or --calibration")
-    prefix = keys.rgb("")
+    prefix = keys.IMAGES
     images = sorted(key.removeprefix(prefix) for key in features if key.startswith(prefix))
     unknown = sorted(set(config.keep or []) - set(images))
     if unknown:

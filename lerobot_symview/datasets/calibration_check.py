@@ -16,8 +16,6 @@ from lerobot_symview.views import Frame
 
 logger = logging.getLogger(__name__)
 
-EPISODES = 3  # first, middle and last
-
 
 def with_depth_unit(reader: FrameReader, depth_unit: float | None) -> FrameReader:
     """Return the reader with the unit of its camera's depth, metres per unit.
@@ -88,9 +86,9 @@ def _check_tables(reader: FrameReader, frames: dict[int, Frame]) -> TablePlane |
 
 
 def _first_frames(reader: FrameReader) -> dict[int, Frame]:
-    """Return episode -> its first frame, for up to three episodes."""
+    """Return episode -> its first frame, for the first, the middle and the last episode."""
     count = len(reader.dataset.episodes)
-    return {episode: _frame(reader, episode, 0) for episode in sorted({0, count // 2, count - 1})[:EPISODES]}
+    return {episode: _frame(reader, episode, 0) for episode in sorted({0, count // 2, count - 1})}
 
 
 def _frame(reader: FrameReader, episode: int, index: int) -> Frame:

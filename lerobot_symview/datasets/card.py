@@ -121,7 +121,7 @@ def _image_row(key: str, feature: dict[str, Any], placement: dict[str, Any] | No
 
 
 def _calibration(dataset: SourceDataset) -> str:
-    known = [key for key in dataset.features if key.startswith("observation.camera.")]
+    known = [key for key in dataset.features if key.startswith(keys.CALIBRATIONS)]
     if not known:
         return ""
     return (

@@ -57,11 +57,11 @@ def check_camera(
     """
     problem = camera_problem(camera, workspace, minimum, pixels)
     if problem is not None:
-        raise CalibrationError(f"camera {name!r} {problem}: {remedy or _causes(camera, workspace, minimum)}")
+        raise CalibrationError(f"camera {name!r} {problem}: {remedy or _causes(camera, workspace)}")
 
 
-def _causes(camera: Camera, workspace: Workspace, minimum: float) -> str:
-    readings = sound_readings(camera, workspace, minimum)
+def _causes(camera: Camera, workspace: Workspace) -> str:
+    readings = sound_readings(camera, workspace)
     causes = [BELOW_TABLE] if camera.position[2] <= 0 else ["check its pose and the workspace"]
     causes += ["it would see the workspace with " + " or with ".join(readings)] if readings else []
     return "; ".join(causes)
@@ -98,29 +98,24 @@ def workspace_pixels(camera: Camera, workspace: Workspace) -> float:
     return float(np.sqrt(abs(area)))
 
 
-def read_differently(camera: Camera) -> dict[str, Camera]:
-    """Return description -> the camera with its pose read differently, the readings with fewest changes first."""
+def read_differently(camera: Camera) -> dict[tuple[str, ...], Camera]:
+    """Return changes -> the camera with its pose read with these changes, those with fewest changes first."""
     readings = {}
     for (axes, theirs_from_opencv), (direction, inverse), (unit, metres) in product(
         AXES.items(), DIRECTIONS.items(), UNITS.items()
     ):
-        changes = [change for change in (direction, unit, axes) if change]
-        if changes:
-            pose = _scaled(camera.world_from_cam, metres)
-            pose = invert_rigid(pose) if inverse else pose
-            pose = pose.copy()
-            pose[:3, :3] = pose[:3, :3] @ theirs_from_opencv
-            readings[" and ".join(changes)] = (len(changes), replace(camera, world_from_cam=pose))
-    return {name: reading for name, (_, reading) in sorted(readings.items(), key=lambda item: item[1][0])}
+        pose = _scaled(camera.world_from_cam, metres)
+        pose = invert_rigid(pose) if inverse else pose
+        pose[:3, :3] = pose[:3, :3] @ theirs_from_opencv
+        changes = tuple(change for change in (direction, unit, axes) if change)
+        readings[changes] = replace(camera, world_from_cam=pose)
+    return {changes: readings[changes] for changes in sorted(readings, key=len) if changes}
 
 
-def sound_readings(camera: Camera, workspace: Workspace, minimum: float = MINIMUM_VISIBLE) -> list[str]:
+def sound_readings(camera: Camera, workspace: Workspace) -> list[str]:
     """Return the descriptions of the simplest other readings of a pose with which the camera sees the workspace."""
-    sound = [
-        name for name, other in read_differently(camera).items() if camera_problem(other, workspace, minimum) is None
-    ]
-    fewest = min((name.count(" and ") for name in sound), default=0)
-    return [name for name in sound if name.count(" and ") == fewest]
+    sound = [changes for changes, other in read_differently(camera).items() if camera_problem(other, workspace) is None]
+    return [" and ".join(changes) for changes in sound if len(changes) == len(sound[0])]
 
 
 def _scaled(pose: Array, metres: float) -> Array:

@@ -88,6 +88,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._units = {} if calibrated is None else {keys.depth(self.camera): calibrated}
         self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
         self._table_units: dict[tuple[str, torch.dtype], float] = {}
+        self._read_units: dict[str, float] = {}
         self._logged: set[tuple[str, float]] = set()
         self._substitutes: set[str] = set()
         self._checked = False
@@ -145,13 +146,15 @@ class ViewsProcessorStep(ObservationProcessorStep):
         """Convert all depth and height images to float metres, once per observation."""
         if IN_METRES in observation:
             return observation
-        converted = {
-            key: _metres(values.detach(), self._unit(key, values.detach(), observation))
+        images = {
+            key: values.detach()
             for key, values in observation.items()
-            if key.startswith(keys.rgb("")) and key.endswith(("_depth", "_height"))
+            if key.startswith(keys.IMAGES) and key.endswith(("_depth", "_height"))
         }
-        if not converted:
+        if not images:
             return observation
+        self._read_units = {key: self._unit(key, values, observation) for key, values in images.items()}
+        converted = {key: _metres(values, self._read_units[key]) for key, values in images.items()}
         return {**observation, **converted, IN_METRES: torch.ones(())}
 
     def _unit(self, key: str, values: Tensor, observation: RobotObservation) -> float:
@@ -194,7 +197,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
                 f"{key} has no valid pixel in the workspace: check the camera, its pose and its lens"
             )
         try:
-            check_table(depth, camera, self._workspace, self._units.get(key))
+            check_table(depth, camera, self._workspace, self._read_units.get(key, METRES))
         except CalibrationError as error:
             raise CalibrationError(f"{key}: {error}") from None
 

@@ -10,7 +10,7 @@ import yaml
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import parse_calibration, plain_calibration
+from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.image_codec import decode_depth
 from lerobot_symview.errors import CalibrationError, DatasetError
@@ -169,13 +169,16 @@ def test_eight_bits_are_no_depth():
         decode_depth(png)
 
 
-def test_intrinsics_of_another_image_size_are_a_warning(caplog):
+def test_intrinsics_of_another_image_size_are_a_warning(tmp_path, caplog):
     k = CAMERA.intrinsics.copy()
     k[:2] /= 2
-    parse_calibration(calibration(intrinsics=k.tolist()))
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump(calibration(intrinsics=k.tolist())))
+    read_calibration(file)
     assert "are the intrinsics those of another image size?" in caplog.text
     caplog.clear()
-    parse_calibration(calibration())
+    file.write_text(yaml.safe_dump(calibration()))
+    read_calibration(file)
     assert not caplog.messages
 
 

@@ -63,7 +63,7 @@ def test_every_reading_undoes_itself():
     true = with_pose(POSE)
     for name, read in read_differently(true).items():
         written = read_differently(read)
-        if name in ("the direction cam_from_world", "OpenGL axes (y up, z backward)"):
+        if name in [("the direction cam_from_world",), ("OpenGL axes (y up, z backward)",)]:
             np.testing.assert_allclose(written[name].world_from_cam, POSE, atol=1e-12)
 
 
