@@ -1,12 +1,13 @@
-"""`symview-experiment`: reruns a table or figure of the paper, and reports the results beside the paper's."""
+"""`symview-experiment`: reruns tables and figures of the paper, and reports the results beside the paper's."""
 
 from __future__ import annotations
 
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import CommandError, run_command, subcommand
 from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
-from symview_eval.experiments.grid import EXPERIMENTS, Cell, select
+from symview_eval.experiments.grid import EXPERIMENTS, Cell
+from symview_eval.experiments.queue import ALL, Costs, chosen_cells, distinct, remaining
 from symview_eval.experiments.report import ReportConfig, report
-from symview_eval.experiments.results import finished_results, unfinished_cells
+from symview_eval.experiments.results import copy_shared, finished_results, unfinished_cells
 from symview_eval.experiments.scale import SCALES
 
 logger = logging.getLogger(__name__)
@@ -27,10 +29,13 @@ EXAMPLES = """\
   symview-experiment table1 --scale=smoke
   symview-experiment table1 --tasks='[block_picking]' --methods='[reproj_equi, sideview_equi]' --demos='[10]'
   symview-experiment figure7 --scale=paper --device=cuda --num_workers=2
+  symview-experiment all --scale=laptop --num_workers=1 --dry_run=true
   symview-experiment report
 
-The first argument is the experiment (table1 to table5, figure5 to figure7), or report, which rebuilds the tables and
-plots of all results."""
+The first argument is the experiment (table1 to table5, figure5 to figure7), all of them (all), or report, which
+rebuilds the tables and plots of all results."""
+
+BATCH = 8  # cells per worker whose demonstrations are recorded together, before they run
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,8 @@ class ExperimentConfig:
     """Folder of results: `<table>/<scale>/<task>/<method>/<demonstrations>/<seed>.csv`."""
     output_dir: Path = Path("outputs/experiments")
     """Folder of demonstrations and policies."""
+    dry_run: bool = False
+    """Print the cells that are left and the time they take, and run nothing."""
 
     def __post_init__(self) -> None:
         lookup("--scale", self.scale, SCALES)
@@ -72,7 +79,7 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
     """Run the cells that `config` selects and that have no result yet.
 
     Args:
-        name: key of `EXPERIMENTS`, such as `table1`.
+        name: key of `EXPERIMENTS`, such as `table1`, or `all`.
         config: which cells, how and where.
 
     Returns:
@@ -83,12 +90,18 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
         ValueError: if the experiment has no such task or method.
     """
     scale = SCALES[config.scale]
-    cells = select(EXPERIMENTS[name], scale, config.tasks, config.methods, config.demos, config.seeds)
-    logger.info("%s, %s", EXPERIMENTS[name].title, name)
+    finished = finished_results(config.results_dir, config.scale)
+    costs = Costs.measured(finished.values())
+    cells = chosen_cells(name, scale, config.tasks, config.methods, config.demos, config.seeds, costs)
+    logger.info("%s", "all tables and figures" if name == ALL else f"{EXPERIMENTS[name].title}, {name}")
     logger.info("scale: %s", scale)
     os.environ["HF_HUB_OFFLINE"] = "1"
-    missing = list(unfinished_cells(cells, config.results_dir, finished_results(config.results_dir, config.scale)))
-    logger.info("%d cells, of which %d already have a result", len(cells), len(cells) - len(missing))
+    missing = unfinished_cells(cells, config.results_dir, finished)
+    for line in remaining(cells, missing, costs):
+        logger.info("%s", line)
+    if config.dry_run:
+        return cells
+    copy_shared(cells, config.results_dir, finished)
     if missing:
         with locked(config.output_dir / RUN_LOCK, config.output_dir, "--output_dir"):
             _run(missing, config)
@@ -96,42 +109,46 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
 
 
 def _run(cells: Sequence[Cell], config: ExperimentConfig) -> None:
-    results, folder = config.results_dir.resolve(), config.output_dir.resolve()
-    with EXECUTORS[config.executor](config.num_workers, "symview_eval.experiments.cells") as executor:
+    runs, failures = distinct(cells), []
+    with (
+        EXECUTORS[config.executor](config.num_workers, "symview_eval.experiments.cells") as executor,
+        tqdm(desc="cells", total=len(runs), unit="cell") as bar,
+    ):
         # slow imports, in parallel with the same imports in the executor's workers
         from symview_eval.experiments.cells import CellJob, Outcome, record_demonstrations, run_cell
 
-        jobs = [CellJob(cell, results, folder, config.device) for cell in cells]
-        recordings = {job.cell.recording: job for job in jobs}.values()
-        recorded = tqdm(
-            executor.run(record_demonstrations, recordings),
-            desc="demonstrations",
-            total=len(recordings),
-            unit="dataset",
-        )
-        errors = {outcome.cell.recording: outcome.failure for outcome in recorded if outcome.failure}
-        failures = [Outcome(job.cell, 0.0, errors[job.cell.recording]) for job in jobs if job.cell.recording in errors]
-        for outcome in failures:
-            tqdm.write(f"failed: {outcome.cell}: {outcome.failure}", file=sys.stderr)
-        runnable = [job for job in jobs if job.cell.recording not in errors]
-        with tqdm(desc="cells", total=len(runnable), unit="cell") as bar:
-            for outcome in executor.run(run_cell, runnable):
+        def run(function: Callable[[CellJob], Outcome], jobs: Sequence[CellJob]) -> list[Outcome]:
+            """Return the failures."""
+            failed = []
+            for outcome in executor.run(function, jobs):
                 if outcome.failure:
-                    failures.append(outcome)
                     tqdm.write(f"failed: {outcome.cell}: {outcome.failure}", file=sys.stderr)
-                else:
+                    failed.append(outcome)
+                elif function is run_cell:
                     bar.set_postfix_str(f"{outcome.cell} took {outcome.seconds:.0f} s", refresh=False)
-                bar.update()
+                bar.update(function is run_cell)
+            return failed
+
+        results, folder = config.results_dir.resolve(), config.output_dir.resolve()
+        for batch in batched(runs, BATCH * config.num_workers):
+            jobs = [CellJob(cell, results, folder, config.device) for cell in batch]
+            unrecorded = run(record_demonstrations, list({job.cell.recording: job for job in jobs}.values()))
+            reasons = {outcome.cell.recording: outcome.failure for outcome in unrecorded}
+            failures += [
+                Outcome(job.cell, 0.0, reasons[job.cell.recording]) for job in jobs if job.cell.recording in reasons
+            ]
+            failures += run(run_cell, [job for job in jobs if job.cell.recording not in reasons])
+            copy_shared(cells, config.results_dir, finished_results(config.results_dir, config.scale))
     if failures:
-        reasons = "; ".join(f"{outcome.cell}: {outcome.failure}" for outcome in failures[:3])
+        first = "; ".join(f"{outcome.cell}: {outcome.failure}" for outcome in failures[:3])
         raise CommandError(
-            f"{len(failures)} of {len(cells)} cells failed; run the same command again to retry them: {reasons}"
+            f"{len(failures)} of {len(runs)} cells failed; run the same command again to retry them: {first}"
         )
 
 
 def main() -> None:
-    """Run the console command: the first argument names the table or figure, or is `report`."""
-    commands: dict[str, Any] = dict.fromkeys(EXPERIMENTS, run_experiment) | {"report": report}
+    """Run the console command: the first argument names the table or figure, or is `all` or `report`."""
+    commands: dict[str, Any] = dict.fromkeys([*EXPERIMENTS, ALL], run_experiment) | {"report": report}
     name = subcommand("experiment", commands)
     if name == "report":
         run_command(ReportConfig, report, EXAMPLES)

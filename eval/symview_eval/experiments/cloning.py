@@ -168,7 +168,8 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
 
 
 def _checkpoint(step: int, loss: float, evaluation: Evaluation) -> Checkpoint:
-    return Checkpoint(step, sum(evaluation.success), len(evaluation.success), evaluation.mean_return, loss)
+    outcomes = "".join(str(int(success)) for success in evaluation.success)
+    return Checkpoint(step, sum(evaluation.success), len(evaluation.success), evaluation.mean_return, loss, outcomes)
 
 
 def _metrics(batch_size: int) -> Any:

@@ -25,6 +25,8 @@ from symview_eval.experiments.summary import (
 
 logger = logging.getLogger(__name__)
 
+CONFIDENT = 0.95
+
 
 @dataclass(frozen=True)
 class ReportConfig:
@@ -55,10 +57,14 @@ class Section:
         return f"{self.experiment.name}_{self.scale.name}"
 
     @property
-    def reversed_pairs(self) -> list[MethodPair]:
-        """Pairs whose measured order is reversed or level, largest difference in the paper first."""
-        reversed_pairs = (pair for pair in self.pairs if pair.measured_difference <= 0)
-        return sorted(reversed_pairs, key=lambda pair: -pair.paper_difference)
+    def holding(self) -> list[MethodPair]:
+        """Pairs whose order in the paper holds here with a probability of 95 % or more."""
+        return [pair for pair in self.pairs if pair.probability >= CONFIDENT]
+
+    @property
+    def contradicted(self) -> list[MethodPair]:
+        """Pairs whose order in the paper holds here with a probability of 5 % or less."""
+        return [pair for pair in self.pairs if pair.probability <= 1 - CONFIDENT]
 
     @property
     def machines(self) -> list[str]:

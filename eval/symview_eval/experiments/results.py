@@ -6,8 +6,8 @@ import csv
 import io
 import logging
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,11 @@ class Checkpoint:
     """Mean discounted return of the episodes."""
     loss: float
     """Mean training loss since the previous checkpoint; nan where it is not recorded."""
+    outcomes: str = ""
+    """1 or 0 for each episode, success or failure, in the order of the scenes' seeds; empty where it is not recorded.
+
+    The scenes of a seed and step are the same for all methods, so that methods are compared scene by scene.
+    """
 
     @property
     def rate(self) -> float:
@@ -110,25 +115,29 @@ def read_result(path: Path) -> Result:
         ) from None
 
 
-def unfinished_cells(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> Iterator[Cell]:
-    """Yield the cells that have no result; copy a result of the same configuration from another table.
+def unfinished_cells(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> list[Cell]:
+    """Return the cells whose configuration has no result, in any table.
 
     Args:
         cells: the cells to check.
         folder: folder of all results.
         configurations: configuration hash -> file, for every existing result.
     """
+    unfinished = [cell for cell in cells if cell.configuration_hash not in configurations]
+    for path in (folder / cell.path for cell in unfinished):
+        if path.exists():
+            logger.info("%s has another configuration and is run again", path)
+    return unfinished
+
+
+def copy_shared(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> None:
+    """Copy results to the cells of other tables that have the same configuration; arguments as above."""
     for cell in cells:
         path, existing = folder / cell.path, configurations.get(cell.configuration_hash)
-        if path.exists() and read_result(path).origin.configuration == cell.configuration_hash:
+        if existing is None or (path.exists() and read_result(path).origin.configuration == cell.configuration_hash):
             continue
-        if existing is None:
-            if path.exists():
-                logger.info("%s has another configuration and is run again", path)
-            yield cell
-        else:
-            logger.info("%s is copied from %s, which has the same configuration", path, existing)
-            write_result(path, read_result(existing))
+        logger.debug("%s is copied from %s, which has the same configuration", path, existing)
+        write_result(path, read_result(existing))
 
 
 def finished_results(folder: Path, scale: str) -> dict[str, Path]:
@@ -143,4 +152,5 @@ def _text(value: float | str) -> str:
 def _parsed(dataclass_type: Any, texts: dict[str, str]) -> dict[str, Any]:
     """Return the values of a dataclass's fields, converted to the fields' types."""
     types = {"int": int, "float": float, "str": str}
-    return {item.name: types[str(item.type)](texts[item.name]) for item in fields(dataclass_type)}
+    named = [item for item in fields(dataclass_type) if item.name in texts or item.default is MISSING]
+    return {item.name: types[str(item.type)](texts[item.name]) for item in named}

@@ -17,7 +17,7 @@ from lerobot_policy_symview.rl.checkpoints import describe
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_eval.experiments import cells as cells_module
-from symview_eval.experiments import cli
+from symview_eval.experiments import cli, queue
 from symview_eval.experiments.cli import ExperimentConfig, run_experiment
 from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.report import ReportConfig, report
@@ -70,6 +70,34 @@ def test_finished_cells_are_not_run_again(copied, monkeypatch):
     run_experiment("table1", config(copied))
     assert [copied / "results" / cell.path for cell in ran] == [removed]
     assert read_result(removed).checkpoints == content  # same seed, same run
+
+
+def test_a_dry_run_tells_what_is_left_and_writes_nothing(copied, caplog):
+    removed = sorted((copied / "results").rglob("*.csv"))[3]
+    removed.unlink()
+    before = sorted(copied.rglob("*"))
+    caplog.set_level("INFO")
+    run_experiment("all", config(copied, dry_run=True))
+    assert "table1: 29 of 30 cells have a result" in caplog.messages
+    assert re.search(
+        r"\d+ runs are left, which serve \d+ cells: 0.\d hours of one core, and \d+ runs of unknown", caplog.text
+    )
+    assert sorted(copied.rglob("*")) == before
+
+
+def test_equal_cells_of_all_experiments_run_once(tmp_path, monkeypatch):
+    ran = []
+    run_cell = cells_module.run_cell
+    monkeypatch.setattr(cells_module, "run_cell", lambda job: ran.append(job.cell) or run_cell(job))
+    monkeypatch.setattr(cli, "BATCH", 1)
+    chosen = config(tmp_path, tasks=["block_stacking"], methods=["reproj_equi", "reproj_equi_local"])
+    monkeypatch.setattr(queue, "EXPERIMENTS", {name: EXPERIMENTS[name] for name in ("table1", "table3", "table4")})
+    run_experiment("all", chosen)
+    assert [cell.row.name for cell in ran] == ["reproj_equi", "reproj_equi_local"]
+    tables = {
+        path.relative_to(tmp_path / "results").parts[0] for path in (tmp_path / "results").rglob("reproj_equi/*/0.csv")
+    }
+    assert tables == {"table1", "table3", "table4"}
 
 
 def test_lerobot_eval_loads_the_policy_of_a_cell(table1, tmp_path, monkeypatch):
@@ -184,6 +212,8 @@ def test_cells_run_on_a_ray_cluster(table1, tmp_path):
         ([], "expected one of: table1"),
         (["table1", "--scale=tiny"], "--scale 'tiny'"),
         (["table1", "--scale=smoke", "--tasks=[block_pulling]"], "'block_pulling'"),
+        (["all", "--tasks=[block_puling]"], "did you mean 'block_pulling'"),
+        (["all", "--methods=[reproj]"], "--methods entry 'reproj'"),
         (["table1", "--demos=[0]"], "--demos must be at least 1"),
         (["table1", "--num_workers=0"], "--num_workers must be at least 1"),
     ],

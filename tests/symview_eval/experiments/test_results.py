@@ -8,6 +8,7 @@ from symview_eval.experiments.results import (
     Origin,
     Result,
     Times,
+    copy_shared,
     finished_results,
     read_result,
     unfinished_cells,
@@ -19,7 +20,10 @@ SCALE = SCALES["laptop"]
 
 
 def result(configuration="0123456789abcdef", successes=(3, 17), seed=0):
-    checkpoints = [Checkpoint(200 * i, count, 20, 0.125 * i, 0.5) for i, count in enumerate(successes, start=1)]
+    checkpoints = [
+        Checkpoint(200 * i, count, 20, 0.125 * i, 0.5, "1" * count + "0" * (20 - count))
+        for i, count in enumerate(successes, start=1)
+    ]
     return Result(
         Origin(configuration, seed, "0.1.0", "Linux x86_64, 2 cores", 101.5, "cpu"), Times(1.0, 90.0), checkpoints
     )
@@ -48,19 +52,24 @@ def test_a_file_without_results_is_refused(text, tmp_path):
 
 def test_a_finished_cell_is_not_run_again(tmp_path):
     (cell,) = cells("table1")
-    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == [cell]
+    assert unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name)) == [cell]
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
-    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == []
+    assert unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name)) == []
 
 
 def test_a_cell_with_other_settings_is_run_again(tmp_path):
     (cell,) = cells("table1")
     write_result(tmp_path / cell.path, result("another"))
-    assert list(unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name))) == [cell]
+    finished = finished_results(tmp_path, SCALE.name)
+    assert unfinished_cells([cell], tmp_path, finished) == [cell]
+    copy_shared([cell], tmp_path, finished)
+    assert read_result(tmp_path / cell.path).origin.configuration == "another"
 
 
 def test_a_result_of_another_table_is_copied(tmp_path):
     (cell,), (equal_cell,) = cells("table1"), cells("table4")
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
-    assert list(unfinished_cells([equal_cell], tmp_path, finished_results(tmp_path, SCALE.name))) == []
+    finished = finished_results(tmp_path, SCALE.name)
+    assert unfinished_cells([equal_cell], tmp_path, finished) == []
+    copy_shared([equal_cell], tmp_path, finished)
     assert read_result(tmp_path / equal_cell.path).checkpoints == result().checkpoints

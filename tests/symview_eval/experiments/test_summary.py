@@ -1,10 +1,19 @@
+import math
+from dataclasses import replace
+
 import pytest
 
 from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.plots import plot
-from symview_eval.experiments.results import write_result
+from symview_eval.experiments.results import Checkpoint, write_result
 from symview_eval.experiments.scale import SCALES
-from symview_eval.experiments.summary import is_current, method_pairs, scales_with_results, table_entries
+from symview_eval.experiments.summary import (
+    is_current,
+    method_pairs,
+    order_probability,
+    scales_with_results,
+    table_entries,
+)
 
 from .test_results import result
 
@@ -61,6 +70,43 @@ def test_pairs_have_the_papers_order(tmp_path):
         ("reproj_equi", "sideview_nonequi", True),
         ("oracle_equi", "sideview_nonequi", True),
     }
+
+
+@pytest.mark.parametrize(
+    ("better", "worse", "probability"),
+    [
+        (["1111100000"], ["0000000000"], 1.0),
+        (["0000000000"], ["1111100000"], 0.0),
+        (["1010101010"], ["1010101010"], 0.5),  # no scene tells them apart
+        (["1111100000"], ["0000011111"], 0.5),
+        (["1111111000", "11"], ["1111000000"], 0.985),  # three scenes of ten: at least one is drawn, 1 - 0.7^10 + half
+        (["1100"], ["0000", "0000"], 0.969),  # 1 - 2^-4 + half of it
+        ([""], [""], None),
+        ([], ["1"], None),
+    ],
+)
+def test_the_probability_of_an_order_is_paired_over_scenes(better, worse, probability):
+    def results(outcomes):
+        return [
+            replace(result(seed=seed), checkpoints=[Checkpoint(1, text.count("1"), len(text), 0.0, 0.0, text)])
+            for seed, text in enumerate(outcomes)
+        ]
+
+    measured = order_probability(results(better), results(worse))
+    assert math.isnan(measured) if probability is None else measured == pytest.approx(probability, abs=0.01)
+
+
+def test_seeds_that_disagree_lower_the_probability():
+    def results(*outcomes):
+        return [
+            replace(result(seed=seed), checkpoints=[Checkpoint(1, text.count("1"), len(text), 0.0, 0.0, text)])
+            for seed, text in enumerate(outcomes)
+        ]
+
+    agree = order_probability(results("1" * 9 + "0" * 11, "1" * 9 + "0" * 11), results("0" * 20, "0" * 20))
+    disagree = order_probability(results("1" * 19 + "0", "0" * 20), results("0" * 20, "1" + "0" * 19))
+    assert agree == 1.0
+    assert disagree == pytest.approx(0.75 + 0.25 * 0.95**40 / 2, abs=0.01)  # a quarter draws the second seed twice
 
 
 def test_a_missing_seed_is_ignored(tmp_path):
