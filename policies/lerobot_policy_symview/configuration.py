@@ -26,6 +26,7 @@ from lerobot_symview.views import VIEWS, View, ViewSpec
 
 CAMERA_IMAGES = ("side", "top")  # a camera's own image in place of a view
 POINT_ENCODERS = ("voxel", "point_cloud")  # lift the camera's image to points in space
+RAY_CHANNELS = 6  # Plücker coordinates
 CROP_SIZES = (64, 128)  # every pooling halves an even size, which keeps D4 exact; the last 8 px become 6, 3, 1
 CHOICES: dict[str, tuple[Any, ...]] = {
     "modality": ("rgb", "rgbd"),
@@ -53,7 +54,8 @@ class SymviewConfig(PreTrainedConfig):
     """
 
     method: str = "reproj_equi"
-    """Preset of the next six fields, one of the paper's methods; a field that is given as well takes precedence."""
+    """Preset of the next seven fields, such as one of the paper's methods; a field that is given as well takes
+    precedence."""
     view: ViewSpec = field(default=None)  # type: ignore[assignment]  # as from_method
     """What the network sees: a view made from `camera` (read from the dataset where it has it), such as `reproj` or
     `{name: persp, plane_height: 0.025}`; `side`, the image of `camera` itself; or `top`, the oracle's. Options are read
@@ -70,6 +72,8 @@ class SymviewConfig(PreTrainedConfig):
     pixel x, y, z and (cos, sin) of twice the yaw; `none` leaves the paper's channels, colour, height and aperture."""
     camera_direction: bool = from_method()
     """Give every pixel the horizontal direction to the camera, which breaks the symmetry (paper 5.7)."""
+    camera_rays: bool = from_method()
+    """Give every pixel of the camera's own image its ray in the world, six Plücker coordinates; plain encoder only."""
     camera: str = "side"
     """Camera from which views are made."""
     width: int = 64
@@ -191,6 +195,12 @@ class SymviewConfig(PreTrainedConfig):
                 "--policy.gripper_input=image draws a top-down image of the gripper, which does not fit "
                 "--policy.view=side: use --policy.gripper_input=vector, or --policy.method=sideview_equi for both"
             )
+        if self.camera_rays and (self.view.name, self.encoder, self.augmentation) != ("side", "plain", "none"):
+            raise ValueError(
+                "--policy.camera_rays=true gives the rays of the camera's own image, which do not rotate with it: use "
+                "--policy.view=side, --policy.encoder=plain and --policy.augmentation=none, got "
+                f"{self.view.name}, {self.encoder} and {self.augmentation}"
+            )
         missing = [label for label in keys.STATE_NAMES if label not in self.state_symmetry]
         if self.gripper_input == "image" and missing:
             raise ValueError(
@@ -227,6 +237,11 @@ class SymviewConfig(PreTrainedConfig):
     def sees_points(self) -> bool:
         """Whether the encoder takes points in space rather than an image."""
         return self.encoder in POINT_ENCODERS
+
+    @property
+    def uses_calibration(self) -> bool:
+        """Whether the policy needs the calibration of its camera."""
+        return self.is_computed or self.sees_points or self.camera_direction or self.camera_rays
 
     @property
     def is_computed(self) -> bool:
@@ -314,7 +329,9 @@ class SymviewConfig(PreTrainedConfig):
     @property
     def channels(self) -> int:
         """Scalar channels of the network's image."""
-        return 3 + (self.modality == "rgbd") + (self.gripper_input == "image")
+        return (
+            3 + (self.modality == "rgbd") + (self.gripper_input == "image") + (RAY_CHANNELS if self.camera_rays else 0)
+        )
 
     def make_view(self) -> View:
         """Return the view."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-EQUIVARIANT = {"encoder": "equivariant", "group": "D4", "camera_direction": False}
+EQUIVARIANT = {"encoder": "equivariant", "group": "D4", "camera_direction": False, "camera_rays": False}
 REPROJECTED = EQUIVARIANT | {"view": "reproj", "modality": "rgbd", "gripper_input": "image"}
 PERSPECTIVE = EQUIVARIANT | {"view": "persp", "modality": "rgb", "gripper_input": "image"}
 SIDEVIEW = EQUIVARIANT | {"view": "side", "modality": "rgbd", "gripper_input": "vector"}
+PLAIN = {"encoder": "plain", "group": "C1"}
 RELAXED = {"encoder": "relaxed"}
 BROKEN = {"camera_direction": True}
 
@@ -16,7 +17,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "persp_equi": PERSPECTIVE,
     "sideview_equi": SIDEVIEW,
     "oracle_equi": REPROJECTED | {"view": "top"},
-    "sideview_nonequi": SIDEVIEW | {"encoder": "plain", "group": "C1"},
+    "sideview_nonequi": SIDEVIEW | PLAIN,
+    "sideview_plucker": SIDEVIEW | PLAIN | {"camera_rays": True},
     "voxel_equi": SIDEVIEW | {"encoder": "voxel"},
     "point_cloud_equi": SIDEVIEW | {"encoder": "point_cloud"},
     "reproj_equi_relaxed": REPROJECTED | RELAXED,
@@ -24,6 +26,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "persp_equi_relaxed": PERSPECTIVE | RELAXED,
     "persp_equi_broken": PERSPECTIVE | BROKEN,
 }
-"""Method -> options of the policy, for the paper's Tables 1 to 3.
+"""Method -> options of the policy, for the paper's Tables 1 to 3, and a baseline for cameras that move.
 
-For RGB, the paper proposes `persp_equi_broken`, whose network also gets the direction to the camera."""
+For RGB, the paper proposes `persp_equi_broken`, whose network also gets the direction to the camera. `sideview_plucker`
+is not in the paper: its network gets the ray of every pixel of the camera's image."""

@@ -25,7 +25,7 @@ from tests.helpers.policies import make_config, make_policy, take_training_steps
 
 BROKEN = [method for method in METHODS if method.endswith("_broken")]
 RELAXED = [method for method in METHODS if method.endswith("_relaxed")]
-NONEQUIVARIANT = ["sideview_nonequi"]
+NONEQUIVARIANT = ["sideview_nonequi", "sideview_plucker"]
 EQUIVARIANT = [method for method in METHODS if method not in BROKEN + RELAXED + NONEQUIVARIANT]
 
 

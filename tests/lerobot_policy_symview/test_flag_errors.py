@@ -32,6 +32,7 @@ WRONG = {
         "group": ("D5", "unknown --policy.group 'D5', expected one of: "),
         "gripper_input": ("drawn", "gripper_input.*'drawn'.*vector"),
         "camera_direction": ("perhaps", "camera_direction.*'perhaps'"),
+        "camera_rays": ("true", "--policy.camera_rays=true gives the rays of the camera's own image"),
         "width": (20, "--policy.width must be a multiple of 16 up to 1024, got 20"),
         "crop_size": (100, "unknown --policy.crop_size '100', expected one of: 64, 128"),
         "theta_representation": ("odd", "theta_representation.*'odd'.*sign"),

@@ -214,6 +214,7 @@ PARAMETER_COUNTS = {
     "sideview_equi": 1_113_242,
     "oracle_equi": 1_113_098,
     "sideview_nonequi": 1_132_565,
+    "sideview_plucker": 1_133_429,  # 6 x 9 weights for each of the first 16 channels more
     "voxel_equi": 1_178_774,
     "point_cloud_equi": 1_178_978,
     "reproj_equi_relaxed": 1_669_354,

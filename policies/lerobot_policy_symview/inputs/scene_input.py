@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.clouds import POINTS, cloud_from_depth
+from lerobot_policy_symview.inputs.rays import plucker_rays
 from lerobot_policy_symview.inputs.state import camera_directions
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
@@ -123,6 +124,8 @@ class ImageInput(SceneInput):
     def __init__(self, config: SymviewConfig, workspace: Workspace):
         super().__init__(config, workspace)
         self._color_key, self._height_key = config.color_key, config.height_key  # once: height_key makes the view
+        feature = (config.input_features or {}).get(self._color_key)
+        self._dataset_size = tuple(feature.shape[-2:]) if feature is not None else None
 
     @property
     def keys(self) -> list[str]:
@@ -132,7 +135,7 @@ class ImageInput(SceneInput):
         if config.modality == "rgbd":
             assert self._height_key is not None
             features.append(self._height_key)
-        if config.camera_direction:
+        if config.camera_direction or config.camera_rays:
             features += [keys.intrinsics(config.camera), keys.world_from_cam(config.camera)]
         if config.view.name == "top" and config.modality == "rgbd":
             features.append(keys.world_from_cam("top"))
@@ -152,6 +155,8 @@ class ImageInput(SceneInput):
             images = transform_images(images, transform)
         if self.config.gripper_input == "image":
             images = torch.cat([images, self._gripper(state, images.shape[-1])[:, None]], dim=1)
+        if self.config.camera_rays:
+            images = torch.cat([images, self._rays(batch, images)], dim=1)
         return crop(images, self.config.crop_size, crop_offset), state
 
     def downscale(self, images: Tensor) -> Tensor:
@@ -171,6 +176,14 @@ class ImageInput(SceneInput):
         if self.config.view.name != "side":
             height = height / self.workspace.height_limit
         return self.downscale(torch.cat([color, height], dim=1))
+
+    def _rays(self, batch: dict[str, Tensor], images: Tensor) -> Tensor:
+        """Return the rays (B, 6, h, w) of downscaled images (B, C, h, w)."""
+        height, width = images.shape[-2:]
+        # stored observations are downscaled already; their calibration is that of the dataset's images
+        size: tuple[int, int] = tuple(batch[self._color_key].shape[-2:])
+        calibrated = self._dataset_size if size == (height, width) and self._dataset_size else size
+        return plucker_rays(*self._calibration(batch), calibrated, (height, width), self.workspace)
 
     def _gripper(self, state: Tensor, pixels: int) -> Tensor:
         """Draw the gripper (B, pixels, pixels)."""

@@ -1,0 +1,70 @@
+"""Plücker coordinates of a camera's pixels."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+
+from lerobot_policy_symview.inputs.rays import plucker_rays
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_symview import keys
+from lerobot_symview.geometry.camera import unproject
+from lerobot_symview.geometry.workspace import Workspace
+from tests.helpers.cameras import make_camera, plane_depth
+from tests.helpers.policies import make_config, training_batch
+
+WORKSPACE = Workspace()
+CENTER = np.array([*WORKSPACE.center, 0.0])
+
+
+def rays(*cameras, size=None):
+    camera = cameras[0]
+    k, pose = (
+        torch.from_numpy(np.stack([getattr(each, name).ravel() for each in cameras]))
+        for name in ("intrinsics", "world_from_cam")
+    )
+    return plucker_rays(k, pose, (camera.height, camera.width), size or (camera.height, camera.width), WORKSPACE)
+
+
+@pytest.mark.parametrize(("elevation", "azimuth"), [(45, 0), (20, 70), (85, -130)])
+def test_points_of_a_pixel_lie_on_its_ray(elevation, azimuth):
+    camera = make_camera(elevation, azimuth)
+    direction, moment = rays(camera)[0].double().permute(1, 2, 0).numpy().reshape(-1, 2, 3).swapaxes(0, 1)
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1, atol=1e-6)
+    for height in (0.0, 0.1):
+        points = unproject(plane_depth(camera, height), camera).reshape(-1, 3) - CENTER
+        np.testing.assert_allclose(np.cross(points, direction), moment, atol=1e-5)
+    ahead = ((points - (camera.position - CENTER)) * direction).sum(axis=1)
+    assert ahead.min() > -1e-9  # 0 where there is no depth
+    assert ahead.max() > 0.5
+
+
+def test_each_sample_has_the_rays_of_its_own_camera():
+    first, second = make_camera(45, 0), make_camera(30, 90)
+    together = rays(first, second)
+    torch.testing.assert_close(together[:1], rays(first))
+    torch.testing.assert_close(together[1:], rays(second))
+
+
+def test_a_downscaled_pixel_has_the_ray_of_its_centre():
+    camera = make_camera(40, 15)
+    whole, half = rays(camera), rays(camera, size=(camera.height // 2, camera.width // 2))
+    mean = torch.nn.functional.avg_pool2d(whole, 2)
+    torch.testing.assert_close(half, mean, atol=1e-5, rtol=0)
+
+
+def test_stored_observations_have_the_rays_of_the_cameras_images():
+    """Stored images are downscaled, their K is not."""
+    config = make_config(method="sideview_plucker")
+    batch = training_batch(config)
+    config.input_features = {
+        keys.rgb("side"): PolicyFeature(FeatureType.VISUAL, tuple(batch[keys.rgb("side")].shape[1:]))
+    }
+    policy = SymviewBcPolicy(config).eval()
+    small = batch | {
+        key: policy.scene.downscale(values) for key, values in batch.items() if getattr(values, "ndim", 0) == 4
+    }
+    assert small[keys.rgb("side")].shape[-1] < batch[keys.rgb("side")].shape[-1]
+    direct, stored = (policy.network_input(each)[0] for each in (batch, small))
+    assert direct.shape[1] == 10
+    torch.testing.assert_close(stored, direct)
