@@ -19,6 +19,7 @@ from symview_sim.rendering import CameraImages, render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
+from symview_sim.sight import place_in_sight, resized
 from symview_sim.tasks import make_task
 
 START_HEIGHT = 0.2  # metres
@@ -48,7 +49,8 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         render_mode: `rgb_array` (or None); `render()` returns the first camera's image.
 
     Raises:
-        CalibrationError: if a camera's image contains less than 60 % of the working volume.
+        CalibrationError: if a camera's image contains less than 60 % of the working volume; from `reset`, if the arm at
+            its start hides more than 70 % of the workspace.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  gymnasium's own form
@@ -63,6 +65,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self._robot = lookup("robot", settings.robot, ROBOTS)
         self.specs = settings.all_cameras
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
+        self._placed = False
         self._scene: Scene | None = None
         self._steps = 0
         corners = self.workspace.corners()
@@ -92,7 +95,10 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self.episode_task.spawn(self.scene, self.np_random)
         self.scene.settle()
         pose_rng, self._sensor_rng = self.np_random.spawn(2)  # cameras do not change the physics
-        self.cameras |= {spec.name: spec.place(self.workspace, pose_rng) for spec in self.specs if spec.varies}
+        for spec in self.specs:
+            if spec.varies or not self._placed:
+                self.cameras[spec.name] = place_in_sight(spec, self.scene.client, self.workspace, pose_rng)
+        self._placed = True
         return self._observe(), {"is_success": False}
 
     def step(self, action: NDArray[np.floating]) -> tuple[EnvObservation, float, bool, bool, dict[str, Any]]:
@@ -117,11 +123,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8]:
         """Return the first camera's image, (256, W, 3) uint8."""
         camera = next(iter(self.cameras.values()))
-        scale = RENDER_HEIGHT / camera.height
-        intrinsics = camera.intrinsics * [[scale], [scale], [1]]
-        intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
-        width = round(scale * camera.width)
-        return render(self.scene.client, Camera(intrinsics, camera.world_from_cam, RENDER_HEIGHT, width)).rgb
+        return render(self.scene.client, resized(camera, RENDER_HEIGHT)).rgb
 
     def close(self) -> None:
         """Shut the simulator down."""

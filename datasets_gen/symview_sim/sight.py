@@ -1,0 +1,69 @@
+"""Which part of the workspace a camera sees past the robot arm, and placements from which it sees enough."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.placement import TRIES, CameraSpec
+from lerobot_symview.geometry.workspace import Workspace
+from symview_sim.rendering import render
+
+LEAST_SEEN = 0.3  # fraction of the workspace: a camera that sees less shows the arm and makes empty views
+ROBOT = 1  # label in a segmentation image
+PIXELS = 96  # rows and columns of the image in which the arm is looked for
+
+
+def place_in_sight(
+    spec: CameraSpec, client: Any, workspace: Workspace, rng: np.random.Generator | None = None
+) -> Camera:
+    """Return the camera that `spec` describes, past the arm; with `rng` and a spread, the first such placement.
+
+    Args:
+        spec: the camera.
+        client: PyBullet client of the scene, the arm at its start.
+        workspace: the square on the table that the camera must see.
+        rng: as for `CameraSpec.place`.
+
+    Raises:
+        CalibrationError: if the arm hides more than 70 % of the workspace from the camera, or from each of 100
+            placements, or as `CameraSpec.place` does.
+    """
+    seen = 0.0
+    for _ in range(TRIES if rng is not None and spec.varies else 1):
+        camera = spec.place(workspace, rng)
+        if not spec.sees_robot:
+            return camera
+        seen = seen_fraction(client, camera, workspace)
+        if seen >= LEAST_SEEN:
+            return camera
+    raise CalibrationError(
+        f"camera {spec.name!r}: the arm hides {1 - seen:.0%} of the workspace, at most {1 - LEAST_SEEN:.0%} may be "
+        f"hidden: change azimuth_deg (got {spec.azimuth_deg:g}) or elevation_deg (got {spec.elevation_deg:g})"
+    )
+
+
+def seen_fraction(client: Any, camera: Camera, workspace: Workspace) -> float:
+    """Return the fraction of the workspace's pixels in a camera's image that do not show the robot; 0 without any."""
+    camera = resized(camera, PIXELS)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    in_camera = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = in_camera @ camera.world_from_cam[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = -camera.position[2] / rays[..., 2]
+        offset = camera.position[:2] + distance[..., None] * rays[..., :2] - workspace.center
+        inside = (rays[..., 2] < 0) & (np.abs(offset) <= workspace.size / 2).all(axis=-1)
+    labels = render(client, camera, labelled=True).labels
+    assert labels is not None
+    return float((labels[inside] != ROBOT).mean()) if inside.any() else 0.0
+
+
+def resized(camera: Camera, height: int) -> Camera:
+    """Return the camera with an image of `height` rows that shows the same."""
+    scale = height / camera.height
+    intrinsics = camera.intrinsics * [[scale], [scale], [1]]
+    intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
+    return Camera(intrinsics, camera.world_from_cam, height, round(scale * camera.width))
