@@ -21,6 +21,7 @@ EXAMPLES = """\
 TASK = "block_picking"
 REPO_ID = f"symview/{TASK}"
 VIEWS_REPO_ID = f"{REPO_ID}_views"
+MOVED_AZIMUTH_DEG = 90  # of the camera in the second evaluation; the demonstrations' camera faces the robot, at 0
 VIEW_SIZE = 76  # pixels: half the camera image's, so that a camera pixel falls into nearly every pixel of the view
 
 
@@ -48,9 +49,9 @@ class DemoConfig:
 
 
 def stages(config: DemoConfig) -> list[Stage]:
-    """Return the four commands of the pipeline."""
-    folder = config.output_dir
-    recorded, views, policy, evaluation = (folder / name for name in ("recorded", "views", "policy", "evaluation"))
+    """Return the five commands of the pipeline."""
+    names = ("recorded", "views", "policy", "evaluation", "evaluation_moved")
+    recorded, views, policy, evaluation, moved = (config.output_dir / name for name in names)
     generate = (
         "symview-generate",
         f"--dataset.repo_id={REPO_ID}",
@@ -74,11 +75,13 @@ def stages(config: DemoConfig) -> list[Stage]:
     )
     train = train_command(config, VIEWS_REPO_ID, views, policy, "--policy.view=reproj")
     evaluate = evaluate_command(config, policy, evaluation)
+    evaluate_moved = evaluate_command(config, policy, moved, f"--env.camera.azimuth_deg={MOVED_AZIMUTH_DEG}")
     return [
         Stage("demonstrations", generate, recorded),
         Stage("views", add_views, views),
         Stage("training", train, policy),
         Stage("evaluation", evaluate, evaluation),
+        Stage("evaluation with the camera moved", evaluate_moved, moved),
     ]
 
 
@@ -107,14 +110,18 @@ def train_command(config: DemoConfig, repo_id: str, dataset: Path, output: Path,
     )
 
 
-def evaluate_command(config: DemoConfig, policy: Path, output: Path) -> tuple[str, ...]:
-    """Return the command that evaluates the policy that `train_command` wrote to the folder `policy`."""
+def evaluate_command(config: DemoConfig, policy: Path, output: Path, *options: str) -> tuple[str, ...]:
+    """Return the command that evaluates the policy that `train_command` wrote to the folder `policy`.
+
+    `options` are flags of the environment.
+    """
     return (
         "lerobot-eval",
         f"--policy.path={policy / 'checkpoints' / 'last' / 'pretrained_model'}",
         "--policy.device=cpu",
         "--env.type=symview",
         f"--env.task={TASK}",
+        *options,
         f"--eval.n_episodes={config.eval_episodes}",
         f"--eval.batch_size={min(config.eval_episodes, 10)}",
         "--eval.use_async_envs=false",

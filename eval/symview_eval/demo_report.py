@@ -24,6 +24,7 @@ from symview_eval.statistics import SuccessRate
 LOSS_LINE = re.compile(r"step:\S+ .*?loss:(\S+)")
 LOG_INTERVAL = re.compile(r"'log_freq': (\d+)")
 FRAME = 2  # frame of the first demonstration to show: the gripper is moving and the arm is in the image
+SHOWN_VIDEOS = 4
 IMAGES = {
     "side": "side camera",
     "side_reproj": "reprojected (RGBD)",
@@ -63,21 +64,22 @@ def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float
 
     Args:
         report: path of the page; its folder holds the stages' logs.
-        stages: the demo's four stages.
+        stages: the demo's five stages.
         seconds: stage name -> seconds that it took.
     """
-    recorded, views, _, evaluation = (stage.result for stage in stages)
+    recorded, views, _, evaluation, moved = (stage.result for stage in stages)
     images: dict[str, NDArray] = {}
     for folder in (recorded, views):
         images |= read_samples(SourceDataset(folder), None, 0, [FRAME])[0].stored
-    videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
     template = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
     ).get_template("demo.html")
     page = template.render(
         success=read_success(evaluation),
+        moved=read_success(moved),
         images=[(title, png_uri(images[name])) for name, title in IMAGES.items()],
-        videos=[data_uri("video/mp4", path.read_bytes()) for path in videos[:4]],
+        videos=_videos(evaluation),
+        moved_videos=_videos(moved),
         chart=_loss_chart(read_losses(next((report.parent / "logs").glob("*-training.log")))),
         stages=[(stage, seconds[stage.name]) for stage in stages],
         total=sum(seconds.values()),
@@ -85,6 +87,12 @@ def write_report(report: Path, stages: Sequence[Stage], seconds: dict[str, float
         machine=f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
     )
     report.write_text(page)
+
+
+def _videos(evaluation: Path) -> list[str]:
+    """Return the first episodes' videos as data URIs."""
+    videos = sorted(evaluation.rglob("eval_episode_*.mp4"), key=lambda path: int(path.stem.rsplit("_", 1)[1]))
+    return [data_uri("video/mp4", path.read_bytes()) for path in videos[:SHOWN_VIDEOS]]
 
 
 def installed_versions() -> dict[str, str]:
