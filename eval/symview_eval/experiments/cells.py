@@ -16,15 +16,17 @@ from pathlib import Path
 import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
+from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.checkpoints import last_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
-from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.runtime.cli import CommandError
+from lerobot_symview.runtime.staging import part_of
 from symview_eval.experiments.cloning import run_cloning
 from symview_eval.experiments.grid import Cell
+from symview_eval.experiments.placements import evaluate_placements
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
@@ -54,8 +56,13 @@ class CellJob:
 
     @property
     def output(self) -> Path:
-        """Folder of the cell's policy."""
-        return self.folder / "policies" / self.cell.path.with_suffix("")
+        """Folder of the cell's policy, which all cells with the same training share."""
+        return self.folder / "policies" / self.cell.training_hash
+
+    @property
+    def policy(self) -> Path:
+        """Folder of the cloned policy's checkpoint."""
+        return self.output / "pretrained_model"
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ def _attempt(job: CellJob, work: Callable[[CellJob], None]) -> Outcome:
 
 def _record(job: CellJob) -> None:
     cell = job.cell
-    env = RecordedEnv(task=cell.task, camera=CameraSpec(elevation_deg=cell.row.elevation_deg))
+    env = RecordedEnv(task=cell.task, camera=cell.row.camera)
     generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
 
 
@@ -99,18 +106,19 @@ def _run(job: CellJob) -> None:
     cell, start = job.cell, time.perf_counter()
     env = EnvSettings(
         task=cell.task,
-        camera=CameraSpec(elevation_deg=cell.row.elevation_deg),
+        camera=cell.row.camera,
         oracle=cell.row.policy["method"].startswith("oracle"),
         max_steps=cell.scale.max_steps,
     )
     times = Times()
     if cell.algorithm == "sacfd":
         checkpoints = _run_rl(job, env)
+    elif cell.placements:
+        if not job.policy.is_dir():
+            _train(job, env)
+        checkpoints, times = evaluate_placements(cell, SymviewBcPolicy.from_pretrained(job.policy), env)
     else:
-        training = run_cloning(cell, open_dataset(job.demonstrations), env, job.device)
-        checkpoints, actor, times = training.checkpoints, training.actor, training.times
-        for part in (actor.policy, actor.preprocessor, actor.postprocessor):
-            part.save_pretrained(job.output / "pretrained_model")
+        checkpoints, times = _train(job, env)
     origin = Origin(
         configuration=cell.configuration_hash,
         seed=cell.seed,
@@ -120,6 +128,17 @@ def _run(job: CellJob) -> None:
         device=job.device,
     )
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
+
+
+def _train(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
+    """Clone the demonstrations and save the policy; return the evaluations during the training and its times."""
+    training = run_cloning(job.cell, open_dataset(job.demonstrations), env, job.device)
+    part = part_of(job.policy)
+    for saved in (training.actor.policy, training.actor.preprocessor, training.actor.postprocessor):
+        saved.save_pretrained(part)
+    shutil.rmtree(job.policy, ignore_errors=True)
+    part.rename(job.policy)
+    return training.checkpoints, training.times
 
 
 def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:

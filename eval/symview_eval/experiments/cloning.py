@@ -25,7 +25,7 @@ from lerobot_policy_symview.rl.demonstrations import observations
 from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluation, evaluate, simulator_config
 from lerobot_symview import keys
 from symview_eval.experiments.grid import Cell
-from symview_eval.experiments.results import Checkpoint, Times
+from symview_eval.experiments.results import Checkpoint, Times, checkpoint
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Simulators
 
@@ -156,7 +156,7 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
                 pending.append((step, metrics.loss.avg, evaluator.submit(policy)))
                 metrics.reset_averages()
         trained = time.perf_counter()
-        checkpoints = [_checkpoint(step, loss, evaluation.result()) for step, loss, evaluation in pending]
+        checkpoints = [checkpoint(step, evaluation.result(), loss) for step, loss, evaluation in pending]
         times = Times(
             preparation_s=ready - begin,
             training_s=trained - ready,
@@ -165,11 +165,6 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
             cpu_s=time.process_time() - begin_cpu + simulators.cpu_seconds(),
         )
         return CloningResult(checkpoints, actor, times)
-
-
-def _checkpoint(step: int, loss: float, evaluation: Evaluation) -> Checkpoint:
-    outcomes = "".join(str(int(success)) for success in evaluation.success)
-    return Checkpoint(step, sum(evaluation.success), len(evaluation.success), evaluation.mean_return, loss, outcomes)
 
 
 def _metrics(batch_size: int) -> Any:

@@ -5,18 +5,18 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from lerobot_policy_symview.methods import METHODS
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.registry import lookup
 from lerobot_symview.views import ViewSpec
 from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 
 Algorithm = Literal["bc", "sacfd"]
-ELEVATION = 45.0  # degrees above the table: the paper's default camera
 HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps, for SACfD
 RL_DEMONSTRATIONS, RL_DEMONSTRATIONS_HARDER = 20, 50
 
@@ -31,8 +31,8 @@ class MethodRow:
     """Its name in the paper."""
     policy: dict[str, Any] = field(hash=False)
     """Policy settings: `method`, and overrides of that method's settings."""
-    elevation_deg: float = ELEVATION
-    """Elevation of the camera, degrees above the table."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
 
     @property
     def policy_options(self) -> dict[str, Any]:
@@ -54,6 +54,8 @@ class Experiment:
     demonstrations: tuple[int, ...] = (5, 10, 50)
     """Numbers of demonstrations for behaviour cloning; for reinforcement learning the paper fixes one per task."""
     algorithm: Algorithm = "bc"
+    placements: tuple[tuple[str, CameraSpec], ...] = ()
+    """Names and cameras of the evaluations after the training; by default there is one camera, the demonstrations'."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,13 @@ class Cell:
     @property
     def recording(self) -> str:
         """Name of its demonstrations, which all methods with the same camera share."""
-        return f"{self.task}_{self.row.elevation_deg:g}deg_{self.demonstrations}_seed{self.seed}"
+        camera = f"{self.row.camera.elevation_deg:g}deg{'_varying' if self.row.camera.varies else ''}"
+        return f"{self.task}_{camera}_{self.demonstrations}_seed{self.seed}"
+
+    @property
+    def placements(self) -> tuple[tuple[str, CameraSpec], ...]:
+        """Names and cameras of the evaluations after the training; empty if it has the demonstrations' camera only."""
+        return EXPERIMENTS[self.experiment].placements
 
     @property
     def steps(self) -> int:
@@ -87,15 +95,16 @@ class Cell:
         return self.scale.rl_steps * (2 if self.task in HARDER_TASKS else 1)
 
     @property
-    def configuration(self) -> dict[str, Any]:
-        """All settings that determine its results; versions and the machine are not among them."""
+    def training(self) -> dict[str, Any]:
+        """All settings that determine its policy and the evaluations during the training."""
         scale = self.scale
         evaluation = [scale.eval_every if self.algorithm == "bc" else scale.rl_eval_every, scale.eval_episodes]
         return {
             "algorithm": self.algorithm,
             "policy": {**scale.policy, **self.row.policy},
             "learning_rate_decay": scale.learning_rate_decay if self.algorithm == "bc" else "none",
-            "elevation_deg": self.row.elevation_deg,
+            "elevation_deg": self.row.camera.elevation_deg,
+            **({"spread": asdict(self.row.camera.spread)} if self.row.camera.varies else {}),
             "task": self.task,
             "demonstrations": self.demonstrations,
             "seed": self.seed,
@@ -105,12 +114,25 @@ class Cell:
         }
 
     @property
+    def training_hash(self) -> str:
+        """Hash of `training`. Cells with equal hashes share one policy."""
+        return _hash(self.training)
+
+    @property
     def configuration_hash(self) -> str:
-        """Hash of `configuration`. Cells of two tables with equal hashes share one run."""
-        return hashlib.sha256(json.dumps(self.configuration, sort_keys=True).encode()).hexdigest()[:16]
+        """Hash of all settings that determine its result, not of versions and the machine.
+
+        Cells of two tables with equal hashes share one run.
+        """
+        cameras = {name: asdict(camera) for name, camera in self.placements}
+        return _hash(self.training | {"placements": cameras}) if cameras else self.training_hash
 
     def __str__(self) -> str:
         return f"{self.row.name} on {self.task}, {self.demonstrations} demonstrations, seed {self.seed}"
+
+
+def _hash(settings: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _row(name: str, label: str, method: str | None = None, **policy: Any) -> MethodRow:
@@ -127,13 +149,37 @@ SIDE, SIDE_RGB = _row("sideview_equi", "Sideview Equi"), _rgb("sideview_equi", "
 PLAIN, PLAIN_RGB = _row("sideview_nonequi", "Sideview NonEqui"), _rgb("sideview_nonequi", "Sideview NonEqui")
 VOXEL, CLOUD = _row("voxel_equi", "Voxel Equi"), _row("point_cloud_equi", "Point Cloud Equi")
 
+BROKEN = _row("persp_equi_broken", "Persp. Equi (broken)")
+PLUCKER = _row("sideview_plucker", "Sideview Plücker")
+
 CLONED_TASKS = ("block_picking", "block_pushing", "drawer_opening", "block_stacking", "block_in_bowl")
 ABLATION_TASKS = ("drawer_opening", "block_stacking", "block_in_bowl")
 ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
 
 
 def _at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
-    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, elevation_deg)
+    camera = CameraSpec(elevation_deg=elevation_deg)
+    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
+
+
+TRANSFERRED = (REPROJ, PERSP, BROKEN, SIDE, PLAIN, PLUCKER, VOXEL, CLOUD)
+ANYWHERE = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0)
+PLACEMENTS = (
+    ("training", CameraSpec()),
+    *(
+        (f"azimuth {azimuth:+d}°", CameraSpec(azimuth_deg=azimuth))
+        for azimuth in (-135, -90, -45, -20, 20, 45, 90, 135)
+    ),
+    *((f"elevation {elevation}°", CameraSpec(elevation_deg=elevation)) for elevation in (15, 30, 60, 75)),
+    ("distance 1.1 m", CameraSpec(distance=1.1)),
+    ("field of view 60°", CameraSpec(fov_deg=60.0)),
+    ("new in every episode", CameraSpec(spread=ANYWHERE)),
+)
+
+
+def _with_varying_camera(row: MethodRow) -> MethodRow:
+    camera = CameraSpec(spread=ANYWHERE)
+    return MethodRow(f"{row.name}_varying", f"{row.label}, trained with many cameras", row.policy, camera)
 
 
 def _with_plane_height(name: str, label: str, plane_height: float | str) -> MethodRow:
@@ -164,7 +210,7 @@ EXPERIMENTS = {
                 _row("reproj_equi_broken", "Reproj. Equi (broken)"),
                 PERSP,
                 _row("persp_equi_relaxed", "Persp. Equi (relaxed)"),
-                _row("persp_equi_broken", "Persp. Equi (broken)"),
+                BROKEN,
             ),
             ABLATION_TASKS,
             (10,),
@@ -204,6 +250,17 @@ EXPERIMENTS = {
             (ORACLE_RGB, PERSP, SIDE_RGB, PLAIN_RGB),
             TASK_NAMES,
             algorithm="sacfd",
+        ),
+        Experiment(
+            "transfer",
+            "A camera that is moved after the training",
+            (
+                *TRANSFERRED,
+                *(_with_varying_camera(row) for row in TRANSFERRED),
+            ),
+            CLONED_TASKS,
+            (10,),
+            placements=PLACEMENTS,
         ),
         Experiment(
             "figure7",

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from symview_eval.experiments.grid import Experiment
 from symview_eval.experiments.results import Result
-from symview_eval.experiments.summary import TableEntry
+from symview_eval.experiments.summary import PlacementEntry, TableEntry
 
 MEASURED_COLOR, PAPER_COLOR = "#1f5fa8", "#c2571a"
 
@@ -22,6 +22,28 @@ def plot(experiment: Experiment, scale: str, entries: Sequence[TableEntry]) -> F
         figure = _curves(entries)
     else:
         figure = _elevations(entries) if experiment.name == "figure7" else _rows(entries)
+    figure.suptitle(f"{experiment.title} ({experiment.name}), scale {scale}", fontsize=10)
+    return figure
+
+
+def plot_placements(experiment: Experiment, scale: str, entries: Sequence[PlacementEntry]) -> Figure:
+    """Return the success rate of every method with every camera as a coloured table, one panel for each task."""
+    tasks = list(dict.fromkeys((entry.task, entry.demonstrations) for entry in entries))
+    heights = [sum((entry.task, entry.demonstrations) == task for entry in entries) for task in tasks]
+    figure = Figure(figsize=(13, 1.6 + 0.32 * sum(heights) + 1.4 * len(tasks)), layout="constrained")
+    axes = figure.subplots(len(tasks), 1, squeeze=False, height_ratios=heights).flatten()
+    for (task, demonstrations), axis in zip(tasks, axes, strict=True):
+        rows = [entry for entry in entries if (entry.task, entry.demonstrations) == (task, demonstrations)]
+        rates = [[100 * rate.mean for rate in entry.rates.values()] for entry in rows]
+        axis.imshow(rates, cmap="viridis", vmin=0, vmax=100, aspect="auto")
+        for y, line in enumerate(rates):
+            for x, rate in enumerate(line):
+                axis.text(
+                    x, y, f"{rate:.0f}", ha="center", va="center", fontsize=8, color="white" if rate < 60 else "black"
+                )
+        axis.set_xticks(range(len(rates[0])), list(rows[0].rates), rotation=35, ha="right", fontsize=8)
+        axis.set_yticks(range(len(rows)), [entry.row.label for entry in rows], fontsize=8)
+        axis.set_title(f"{task.replace('_', ' ')}, {demonstrations} demonstrations: success, %", fontsize=10)
     figure.suptitle(f"{experiment.title} ({experiment.name}), scale {scale}", fontsize=10)
     return figure
 
@@ -76,7 +98,7 @@ def _elevations(entries: Sequence[TableEntry]) -> Figure:
                 series.setdefault(f"{entry.row.label.split(',')[0]} ({modality})", []).append(entry)
         for label, members in series.items():
             is_oracle = "Oracle" in label
-            elevations = [90.0 if is_oracle else entry.row.elevation_deg for entry in members]
+            elevations = [90.0 if is_oracle else entry.row.camera.elevation_deg for entry in members]
             estimates = [entry.last_five for entry in members]
             rates = [100 * estimate.mean for estimate in estimates]
             below = [100 * (estimate.mean - estimate.low) for estimate in estimates]

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_symview.registry import lookup
-from symview_eval.experiments.grid import EXPERIMENTS, Cell, select
+from symview_eval.experiments.grid import EXPERIMENTS, Cell, Experiment, select
 from symview_eval.experiments.results import read_result
 from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 
 ALL = "all"
 FIRST_TASKS = ("block_picking", "drawer_opening")  # of the figures
+TRANSFER_TASKS = ("block_picking", "block_pushing", "drawer_opening")
 
 
 @dataclass(frozen=True)
@@ -28,23 +29,24 @@ class Costs:
         """Return the costs of finished results; `<table>/<scale>/<task>/<method>/<demonstrations>/<seed>.csv`."""
         seconds: dict[tuple[str, ...], list[float]] = {}
         for path in results:
-            table, _, task, row = path.parts[-6:-2]
+            table, _, task, row = path.parts[-6:-2]  # the experiment, its scale, …
             cell_seconds = read_result(path).times.cpu_s
             if cell_seconds > 0 and row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
-                for key in _keys(EXPERIMENTS[table].algorithm, rows[row].policy["method"], task):
+                for key in _keys(EXPERIMENTS[table], rows[row].policy["method"], task):
                     seconds.setdefault(key, []).append(cell_seconds)
         return cls({key: statistics.median(values) for key, values in seconds.items()})
 
     def seconds(self, cell: Cell) -> float | None:
         """Return the expected processor seconds of a cell; None before any cell of its algorithm is finished."""
-        for key in _keys(cell.algorithm, cell.row.policy["method"], cell.task):
+        for key in _keys(EXPERIMENTS[cell.experiment], cell.row.policy["method"], cell.task):
             if key in self.medians:
                 return self.medians[key]
         return None
 
 
-def _keys(algorithm: str, method: str, task: str) -> list[tuple[str, ...]]:
-    return [(algorithm, method, task), (algorithm, method), (algorithm,)]
+def _keys(experiment: Experiment, method: str, task: str) -> list[tuple[str, ...]]:
+    kind = experiment.name if experiment.placements else experiment.algorithm
+    return [(kind, method, task), (kind, method), (kind,)]
 
 
 def chosen_cells(
@@ -89,12 +91,14 @@ def chosen_cells(
 
 
 def _rank(cell: Cell) -> int:
-    """Return how soon a cell is run: tables 1 and 2 at 10 demonstrations, then the ablations, then the figures."""
+    """Return how soon a cell is run: tables 1 and 2 at 10 demonstrations, the ablations, then figures and transfer."""
     if cell.experiment in ("table1", "table2") and cell.demonstrations == 10:
         return 0
     if cell.experiment in ("table3", "table4", "table5") and cell.seed < 2:
         return 1
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
+        return 2
+    if cell.experiment == "transfer" and cell.task in TRANSFER_TASKS:
         return 2
     return 3
 

@@ -15,10 +15,13 @@ from symview_eval.contact_sheet import data_uri
 from symview_eval.experiments.grid import EXPERIMENTS, Experiment
 from symview_eval.experiments.scale import SCALES, Scale
 from symview_eval.experiments.summary import (
+    Entry,
     MethodPair,
+    PlacementEntry,
     TableEntry,
     is_current,
     method_pairs,
+    placement_entries,
     scales_with_results,
     table_entries,
 )
@@ -45,7 +48,9 @@ class Section:
     experiment: Experiment
     scale: Scale
     entries: list[TableEntry]
-    stale_entries: list[TableEntry]
+    placements: list[PlacementEntry]
+    """In place of `entries`, for an experiment with several cameras."""
+    stale_entries: list[Entry]
     """Entries with results of another configuration than the experiment's present one."""
     pairs: list[MethodPair]
     plot_png: bytes
@@ -69,7 +74,8 @@ class Section:
     @property
     def machines(self) -> list[str]:
         """Machines and package versions of the results."""
-        origins = (result.origin for entry in self.entries for result in entry.results)
+        entries: list[Entry] = [*self.entries, *self.placements]
+        origins = (result.origin for entry in entries for result in entry.results)
         return sorted({f"{origin.machine} (version {origin.version})" for origin in origins})
 
 
@@ -117,10 +123,13 @@ def points(difference: float) -> str:
 
 
 def _section(experiment: Experiment, scale: str, folder: Path) -> Section:
-    from symview_eval.experiments.plots import plot  # imports matplotlib, which takes long
+    from symview_eval.experiments.plots import plot, plot_placements  # imports matplotlib, which takes long
 
-    entries = table_entries(experiment, scale, folder)
-    stale = [entry for entry in entries if not is_current(entry, experiment, scale)]
+    entries = [] if experiment.placements else table_entries(experiment, scale, folder)
+    placements = placement_entries(experiment, scale, folder) if experiment.placements else []
+    stale: list[Entry] = [*entries, *placements]
+    stale = [entry for entry in stale if not is_current(entry, experiment, scale)]
+    figure = plot_placements(experiment, scale, placements) if placements else plot(experiment, scale, entries)
     stream = io.BytesIO()
-    plot(experiment, scale, entries).savefig(stream, format="png", dpi=110)
-    return Section(experiment, SCALES[scale], entries, stale, method_pairs(entries), stream.getvalue())
+    figure.savefig(stream, format="png", dpi=110)
+    return Section(experiment, SCALES[scale], entries, placements, stale, method_pairs(entries), stream.getvalue())

@@ -9,10 +9,13 @@ import math
 from collections.abc import Iterable
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_symview.runtime.staging import part_of
 from symview_eval.experiments.grid import Cell
+
+if TYPE_CHECKING:
+    from lerobot_policy_symview.rl.rollouts import Evaluation
 
 logger = logging.getLogger(__name__)
 
@@ -33,11 +36,20 @@ class Checkpoint:
 
     The scenes of a seed and step are the same for all methods, so that methods are compared scene by scene.
     """
+    camera: str = ""
+    """The camera's placement, where an experiment evaluates with several cameras; they have the same scenes."""
 
     @property
     def rate(self) -> float:
         """Successes per episode."""
         return self.successes / self.episodes
+
+
+def checkpoint(step: int, evaluation: Evaluation, loss: float = math.nan, camera: str = "") -> Checkpoint:
+    """Return the checkpoint of an evaluation after `step` training steps."""
+    outcomes = "".join(str(int(success)) for success in evaluation.success)
+    successes, episodes = sum(evaluation.success), len(evaluation.success)
+    return Checkpoint(step, successes, episodes, evaluation.mean_return, loss, outcomes, camera)
 
 
 @dataclass(frozen=True)

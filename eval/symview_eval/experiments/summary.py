@@ -36,7 +36,7 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class TableEntry:
+class Entry:
     """Results of one method, task and number of demonstrations."""
 
     row: MethodRow
@@ -44,6 +44,12 @@ class TableEntry:
     demonstrations: int
     results: tuple[Result, ...]
     """One result per seed."""
+
+
+@dataclass(frozen=True)
+class TableEntry(Entry):
+    """Success rates by checkpoint."""
+
     best: Estimate
     """Rate of each training's best checkpoint, as the paper reports it; this is optimistic."""
     last: Estimate
@@ -62,6 +68,14 @@ class TableEntry:
     def difference(self) -> float:
         """Mean of `best` minus the paper's rate."""
         return self.best.mean - self.paper
+
+
+@dataclass(frozen=True)
+class PlacementEntry(Entry):
+    """Success rates by camera."""
+
+    rates: dict[str, Estimate]
+    """Success rate with each camera, by its name."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +103,27 @@ class MethodPair:
 def table_entries(experiment: Experiment, scale: str, folder: Path) -> list[TableEntry]:
     """Return the entries of an experiment at a scale, sorted by task, number of demonstrations and row."""
     paper = paper_values(experiment.name)
+    return [_entry(*key, results, paper) for key, results in _grouped(experiment, scale, folder).items()]
+
+
+def placement_entries(experiment: Experiment, scale: str, folder: Path) -> list[PlacementEntry]:
+    """Return the entries of an experiment with several cameras; arguments and order as in `table_entries`."""
+    return [
+        PlacementEntry(*key, results, _by_camera(results))
+        for key, results in _grouped(experiment, scale, folder).items()
+    ]
+
+
+def _by_camera(results: Sequence[Result]) -> dict[str, Estimate]:
+    names = [point.camera for point in results[0].checkpoints]
+    return {
+        name: _pooled([[point for point in result.checkpoints if point.camera == name] for result in results])
+        for name in names
+    }
+
+
+def _grouped(experiment: Experiment, scale: str, folder: Path) -> dict[tuple[MethodRow, str, int], tuple[Result, ...]]:
+    """Return the results of each row, task and number of demonstrations."""
     groups: dict[tuple[str, int, str], list[Result]] = {}
     rows = {row.name: row for row in experiment.rows}
     for path in sorted((folder / experiment.name / scale).glob("*/*/*/*.csv")):
@@ -97,10 +132,8 @@ def table_entries(experiment: Experiment, scale: str, folder: Path) -> list[Tabl
             groups.setdefault((task, int(demonstrations), row), []).append(read_result(path))
     row_order = {row: index for index, row in enumerate(rows)}
     task_order = {task: index for index, task in enumerate(experiment.tasks)}
-    return [
-        _entry(rows[row], task, demonstrations, tuple(groups[task, demonstrations, row]), paper)
-        for task, demonstrations, row in sorted(groups, key=lambda key: (task_order[key[0]], key[1], row_order[key[2]]))
-    ]
+    ordered = sorted(groups, key=lambda key: (task_order[key[0]], key[1], row_order[key[2]]))
+    return {(rows[row], task, count): tuple(groups[task, count, row]) for task, count, row in ordered}
 
 
 def order_probability(better: Sequence[Result], worse: Sequence[Result]) -> float:
@@ -195,7 +228,7 @@ def scales_with_results(experiment: Experiment, folder: Path) -> list[str]:
     return [scale for scale in SCALES if any((folder / experiment.name / scale).glob("*/*/*/*.csv"))]
 
 
-def is_current(entry: TableEntry, experiment: Experiment, scale: str) -> bool:
+def is_current(entry: Entry, experiment: Experiment, scale: str) -> bool:
     """Whether all of an entry's results have the experiment's present configuration."""
     seeds = [result.origin.seed for result in entry.results]
     cells = select(experiment, SCALES[scale], [entry.task], [entry.row.name], [entry.demonstrations], seeds)

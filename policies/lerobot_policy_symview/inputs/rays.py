@@ -9,7 +9,11 @@ from lerobot_symview.geometry.workspace import Workspace
 
 
 def plucker_rays(
-    intrinsics: Tensor, world_from_cam: Tensor, calibrated: tuple[int, int], size: tuple[int, int], workspace: Workspace
+    intrinsics: Tensor,
+    world_from_cam: Tensor,
+    calibrated: tuple[int, ...],
+    size: tuple[int, ...],
+    workspace: Workspace,
 ) -> Tensor:
     """Return the Plücker coordinates (B, 6, h, w) of the rays of an image's pixels, float32.
 

@@ -125,7 +125,7 @@ class ImageInput(SceneInput):
         super().__init__(config, workspace)
         self._color_key, self._height_key = config.color_key, config.height_key  # once: height_key makes the view
         feature = (config.input_features or {}).get(self._color_key)
-        self._dataset_size = tuple(feature.shape[-2:]) if feature is not None else None
+        self._dataset_size = feature.shape[-2:] if feature is not None else None
 
     @property
     def keys(self) -> list[str]:
@@ -179,11 +179,10 @@ class ImageInput(SceneInput):
 
     def _rays(self, batch: dict[str, Tensor], images: Tensor) -> Tensor:
         """Return the rays (B, 6, h, w) of downscaled images (B, C, h, w)."""
-        height, width = images.shape[-2:]
+        size, recorded = images.shape[-2:], batch[self._color_key].shape[-2:]
         # stored observations are downscaled already; their calibration is that of the dataset's images
-        size: tuple[int, int] = tuple(batch[self._color_key].shape[-2:])
-        calibrated = self._dataset_size if size == (height, width) and self._dataset_size else size
-        return plucker_rays(*self._calibration(batch), calibrated, (height, width), self.workspace)
+        calibrated = self._dataset_size if recorded == size and self._dataset_size else recorded
+        return plucker_rays(*self._calibration(batch), calibrated, size, self.workspace)
 
     def _gripper(self, state: Tensor, pixels: int) -> Tensor:
         """Draw the gripper (B, pixels, pixels)."""

@@ -23,7 +23,7 @@ from symview_eval.experiments.grid import EXPERIMENTS, select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
 from symview_eval.experiments.scale import SCALES
-from symview_eval.experiments.summary import table_entries
+from symview_eval.experiments.summary import placement_entries, table_entries
 
 pytestmark = pytest.mark.long
 
@@ -101,7 +101,8 @@ def test_equal_cells_of_all_experiments_run_once(tmp_path, monkeypatch):
 
 
 def test_lerobot_eval_loads_the_policy_of_a_cell(table1, tmp_path, monkeypatch):
-    policy = table1 / "output/policies/table1/smoke/block_picking/reproj_equi/1/0/pretrained_model"
+    (cell,) = select(EXPERIMENTS["table1"], SCALES["smoke"], ["block_picking"], ["reproj_equi"])
+    policy = table1 / "output" / "policies" / cell.training_hash / "pretrained_model"
     arguments = [
         "lerobot-eval",
         f"--policy.path={policy}",
@@ -140,6 +141,24 @@ def test_every_experiment_runs_and_is_reported(name, tmp_path):
     assert (page.parent / f"{name}_smoke.png").is_file()
 
 
+def test_transfer_evaluates_the_policy_of_another_table_with_every_camera(copied, monkeypatch):
+    monkeypatch.setattr(cells_module, "run_cloning", None)  # nothing is trained
+    chosen = config(copied, tasks=["block_picking"], methods=["reproj_equi", "sideview_nonequi"])
+    run_experiment("transfer", chosen)
+    for path in (copied / "results" / "transfer").rglob("*.csv"):
+        result = read_result(path)
+        assert [point.camera for point in result.checkpoints] == [
+            name for name, _ in EXPERIMENTS["transfer"].placements
+        ]
+        assert {(point.step, point.episodes) for point in result.checkpoints} == {(2, 1)}
+        assert result.times.cpu_s > 0
+    entries = placement_entries(EXPERIMENTS["transfer"], "smoke", copied / "results")
+    assert [entry.row.name for entry in entries] == ["reproj_equi", "sideview_nonequi"]
+    page = report(ReportConfig(copied / "results", copied / "report")).read_text()
+    assert "azimuth +90°" in page
+    assert (copied / "report" / "transfer_smoke.png").is_file()
+
+
 def test_the_other_cells_run_after_one_fails(tmp_path, monkeypatch):
     run_cloning = cells_module.run_cloning
 
@@ -175,10 +194,10 @@ def test_a_changed_rl_cell_starts_from_the_beginning(tmp_path, monkeypatch):
     def train(configuration):
         """Write the files that a training writes: its flags and an evaluation."""
         resumed.append(configuration.resume)
-        last = job.output / "checkpoints" / "last" / "pretrained_model"
+        last = configuration.output_dir / "checkpoints" / "last" / "pretrained_model"
         last.mkdir(parents=True, exist_ok=True)
         (last / "train_config.json").write_text(json.dumps(describe(configuration)))
-        (job.output / "evaluation.csv").write_text("step,success,return\n1,1.0,0.5\n")
+        (configuration.output_dir / "evaluation.csv").write_text("step,success,return\n1,1.0,0.5\n")
 
     monkeypatch.setattr(cells_module, "train_rl", train)
     longer = dataclasses.replace(cell, scale=dataclasses.replace(cell.scale, rl_steps=3))
