@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from lerobot_symview.calibration.board import Corners
+from lerobot_symview.calibration.board_corners import Corners
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, calibration_problems, invert_rigid
 
@@ -106,7 +106,8 @@ def board_pose(corners: Corners, intrinsics: Intrinsics, width: int) -> BoardPos
         if angle > SAME_POSE and difference < LEAST_DIFFERENCE:
             raise CalibrationError(
                 f"two poses of the board, {angle:.1f} degrees apart, fit its corners, with reprojection errors of "
-                f"{errors[0]:.2f} and {error:.2f} pixels: let it fill more of the image, and not face the camera squarely"
+                f"{errors[0]:.2f} and {error:.2f} pixels: "
+                "let it fill more of the image, and face the camera less squarely"
             )
     uncertainty_deg, uncertainty_mm = _uncertainty(corners, best, intrinsics, noise)
     if uncertainty_deg > MOST_UNCERTAIN:

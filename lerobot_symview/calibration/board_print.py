@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_symview.calibration.board import Board
+from lerobot_symview.calibration.board import Board, board_pattern
 from lerobot_symview.errors import OptionError
 
 FORMATS = (".pdf", ".png")
@@ -29,25 +27,8 @@ class Print(NamedTuple):
     dpi: float
 
 
-def board_pattern(board: Board, square: int) -> NDArray[np.uint8]:
-    """Return the board's pattern, (H, W) uint8, 0 or 255, without a border, with `square` pixels per square."""
-    if board.type == "chessboard":
-        white = np.indices((board.rows, board.columns)).sum(axis=0) % 2
-        return (255 * white).astype(np.uint8).repeat(square, axis=0).repeat(square, axis=1)
-    if board.type == "charuco":
-        return board.aruco.generateImage((board.columns * square, board.rows * square), marginSize=0, borderBits=1)
-    side = round(square * board.marker_side / board.square)
-    gap = square - side
-    pattern = np.full((board.rows * square - gap, board.columns * square - gap), 255, dtype=np.uint8)
-    for number in range(board.marker_count):
-        row, column = divmod(number, board.columns)
-        marker = cv2.aruco.generateImageMarker(board.aruco.getDictionary(), number, side)
-        pattern[row * square : row * square + side, column * square : column * square + side] = marker
-    return pattern
-
-
 def board_print(board: Board) -> Print:
-    """Return a page with the board at its true size; the page is the smallest of A4 to A0 that holds it, if one does."""
+    """Return a page with the board at its true size, on the smallest of A4 to A0 that holds it."""
     square = round(board.square / INCH * DPI)
     metre = square / board.square  # pixels
     pattern = board_pattern(board, square)
