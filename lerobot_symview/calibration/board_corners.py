@@ -203,6 +203,7 @@ def _shift(
     """
     weight = np.sqrt(inside).ravel()[:, None]
     basis = np.linalg.qr(weight * np.column_stack([np.ones(template.size), template.ravel()]))[0]
+    contrast = float(basis[:, 1] @ (weight[:, 0] * template.ravel()))
     slopes = weight * gradients.reshape(2, -1).T
     slopes -= basis @ (basis.T @ slopes)
     height, width = template.shape
@@ -211,19 +212,18 @@ def _shift(
     for _ in range(ITERATIONS):
         sampled = cv2.getRectSubPix(image, (width, height), center + shift)
         values = weight[:, 0] * sampled.ravel()
-        coordinates = basis.T @ values
-        if coordinates[1] * (basis[:, 1] @ (weight[:, 0] * template.ravel())) <= 0:  # contrast is inverted or absent
+        level, amplitude = basis.T @ values
+        if amplitude * contrast <= 0:  # inverted or absent
             return None
-        gain = coordinates[1] / (basis[:, 1] @ (weight[:, 0] * template.ravel()))
-        step = np.linalg.lstsq(gain * slopes, values - basis @ coordinates, rcond=None)[0]
+        residuals = values - basis @ [level, amplitude]
+        step = np.linalg.lstsq(amplitude / contrast * slopes, residuals, rcond=None)[0]
         shift -= step
         if np.linalg.norm(step) < CONVERGED:
             break
         if np.linalg.norm(shift) > min(height, width) / 2:
             return None
-    mean = basis[:, 0] * coordinates[0]
-    explained, total = coordinates[1], np.linalg.norm(values - mean)
-    return shift if abs(explained) >= LEAST_CORRELATION * total else None
+    explained = abs(amplitude) / np.hypot(amplitude, np.linalg.norm(residuals))
+    return shift if explained >= LEAST_CORRELATION else None
 
 
 def _reason(grey: NDArray, board: Board, corners: int) -> str:

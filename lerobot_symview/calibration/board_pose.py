@@ -23,7 +23,7 @@ SAME_POSE = 0.5  # degrees between two solutions that are one
 LEAST_DIFFERENCE = 16.0  # between the squared errors of two poses, in variances of a corner: four standard deviations
 MOST_UNCERTAIN = 0.5  # degrees, standard deviation of the board's orientation
 LEAST_VIEWS, LEAST_TILT = 5, 15.0  # for intrinsics: images, and degrees between the most different boards
-MOST_UNCERTAIN_FOCAL = 0.01  # standard deviation of the focal lengths, relative
+MOST_UNCERTAIN_FOCAL = 0.005  # standard deviation of the focal lengths, relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ def estimate_intrinsics(views: Mapping[str, Corners], height: int, width: int) -
         raise CalibrationError(
             f"the images do not determine the intrinsics: the boards are tilted by at most {tilt:.0f} degrees to each "
             f"other and the focal length is uncertain by {uncertainty:.1%}, expected at least {LEAST_TILT:.0f} degrees "
-            f"and at most {MOST_UNCERTAIN_FOCAL:.0%}: add images in which the board leans to the left, the right, "
+            f"and at most {MOST_UNCERTAIN_FOCAL:.1%}: add images in which the board leans to the left, the right, "
             "forward and back, near the image's corners too"
         )
     errors_px = dict(zip(views, errors[:, 0].tolist(), strict=True))

@@ -310,8 +310,11 @@ def _write(config: CalibrateConfig, known: Calibration, workspace: Workspace, re
     }
     if config.camera in known.depth_units:
         entry["depth_unit"] = known.depth_units[config.camera]
-    content = plain_calibration(known) | {"workspace": asdict(workspace) | {"center": list(workspace.center)}}
-    content["cameras"] = content["cameras"] | {config.camera: entry}
+    content = {
+        "units": "m",
+        "workspace": asdict(workspace) | {"center": list(workspace.center)},
+        "cameras": plain_calibration(known)["cameras"] | {config.camera: entry},
+    }
     parse_calibration(content)
     if result.distortion.any():
         entry["distortion"] = result.distortion.round(8).tolist()
