@@ -151,3 +151,13 @@ def board_pattern(board: Board, square: int) -> NDArray[np.uint8]:
         marker = cv2.aruco.generateImageMarker(board.aruco.getDictionary(), number, side)
         pattern[row * square : row * square + side, column * square : column * square + side] = marker
     return pattern
+
+
+def pixels_per_square(board: Board, low: int, high: int) -> int:
+    """Return the pixels per square in [low, high] at which the edges of markers and their bits lie best on pixels."""
+    if board.type == "chessboard":
+        return high
+    ratio, cells = board.marker_side / board.square, board.markers.markerSize + 2
+    sides = np.arange(low, high + 1)[::-1]
+    edges = np.stack([sides * ratio / cells, sides * (1 - ratio) / 2])
+    return int(sides[np.argmin(np.abs(edges - edges.round()).max(axis=0).round(6))])

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.calibration.board import DICTIONARIES, Board, board_pattern
+from lerobot_symview.calibration.board import DICTIONARIES, Board, board_pattern, pixels_per_square
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array
 
@@ -26,7 +26,7 @@ WINDOW = 0.8  # squares: half the side of the window in which the pattern is ali
 LARGEST_SHIFT = 0.3  # squares
 LEAST_CORRELATION = 0.8  # of the pattern with the image; occluded corners have less
 LEAST_INSIDE = 0.7  # of the window's area
-FINE = 256  # pixels per square
+LARGEST_SQUARE = 64  # pixels: enough for a hundredth of a pixel
 ITERATIONS, CONVERGED = 20, 1e-3  # pixels
 
 
@@ -152,7 +152,8 @@ def _aligned(grey: NDArray, board: Board, corners: Corners) -> Corners:
     image_from_board = _image_from_board(corners)
     outline = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]]) * board.size
     area = cv2.contourArea(cv2.perspectiveTransform(outline, image_from_board).astype(np.float32))
-    square = int(np.clip(board.square * np.sqrt(area / np.prod(board.size)), 8, 200))
+    in_image = board.square * np.sqrt(area / np.prod(board.size))  # pixels
+    square = int(np.clip(in_image, 8, LARGEST_SQUARE))
     pattern = _pattern(board, square)
     step = board.square / square  # metres per pixel of the pattern
     board_from_pattern = np.array(
@@ -160,7 +161,10 @@ def _aligned(grey: NDArray, board: Board, corners: Corners) -> Corners:
     )
     image_from_pattern = image_from_board @ board_from_pattern
     shape, inverse = pattern.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    rectified = cv2.warpPerspective(grey.astype(np.float32), image_from_pattern, shape, flags=inverse)
+    smooth = grey.astype(np.float32)
+    if in_image > square:  # the rectified image is coarser
+        smooth = cv2.GaussianBlur(smooth, (0, 0), in_image / square / 2)
+    rectified = cv2.warpPerspective(smooth, image_from_pattern, shape, flags=inverse)
     inside = cv2.warpPerspective(np.ones(grey.shape, np.float32), image_from_pattern, shape, flags=inverse)
     pattern, rectified = (cv2.GaussianBlur(image, (0, 0), 1.0) for image in (pattern, rectified))
     gradients = np.stack(np.gradient(pattern)[::-1])
@@ -187,8 +191,9 @@ def _pattern(board: Board, square: int) -> NDArray[np.float32]:
 
     It is reduced from a finer one: markers seldom have a whole number of pixels.
     """
-    fine = np.full((board.rows * FINE, board.columns * FINE), 255, dtype=np.float32)
-    pattern = board_pattern(board, FINE)
+    side = pixels_per_square(board, 192, 384)
+    fine = np.full((board.rows * side, board.columns * side), 255, dtype=np.float32)
+    pattern = board_pattern(board, side)
     fine[: pattern.shape[0], : pattern.shape[1]] = pattern
     reduced = cv2.resize(fine, (board.columns * square, board.rows * square), interpolation=cv2.INTER_AREA)
     return np.pad(reduced, square, constant_values=255)
@@ -206,6 +211,7 @@ def _shift(
     contrast = float(basis[:, 1] @ (weight[:, 0] * template.ravel()))
     slopes = weight * gradients.reshape(2, -1).T
     slopes -= basis @ (basis.T @ slopes)
+    inverse = np.linalg.pinv(slopes)
     height, width = template.shape
     center = np.array([window[1].start + (width - 1) / 2, window[0].start + (height - 1) / 2])
     shift = np.zeros(2)
@@ -216,7 +222,7 @@ def _shift(
         if amplitude * contrast <= 0:  # inverted or absent
             return None
         residuals = values - basis @ [level, amplitude]
-        step = np.linalg.lstsq(amplitude / contrast * slopes, residuals, rcond=None)[0]
+        step = contrast / amplitude * (inverse @ residuals)
         shift -= step
         if np.linalg.norm(step) < CONVERGED:
             break

@@ -91,7 +91,7 @@ def board_pose(corners: Corners, intrinsics: Intrinsics, width: int) -> BoardPos
     if errors[0] > LARGE_ERROR * width:
         raise CalibrationError(
             f"the reprojection error is {errors[0]:.2f} pixels, expected at most {LARGE_ERROR * width:.1f}: "
-            "the intrinsics or the lens, the board's columns, rows, square and marker, or a bent board"
+            "check the intrinsics, the lens distortion, the board's columns, rows and marker, and that it is flat"
         )
     elevation = _elevation(best, corners)
     if elevation < LEAST_ELEVATION:
@@ -145,19 +145,19 @@ def estimate_intrinsics(views: Mapping[str, Corners], height: int, width: int) -
     normals = np.stack([cv2.Rodrigues(rotation)[0][:, 2] for rotation in rotations])
     tilt = float(np.rad2deg(np.arccos(np.clip(normals @ normals.T, -1, 1).min())))
     uncertainty = float((deviations[:2, 0] / np.diag(matrix)[:2]).max())
-    if tilt < LEAST_TILT or not uncertainty < MOST_UNCERTAIN_FOCAL:
-        raise CalibrationError(
-            f"the images do not determine the intrinsics: the boards are tilted by at most {tilt:.0f} degrees to each "
-            f"other and the focal length is uncertain by {uncertainty:.1%}, expected at least {LEAST_TILT:.0f} degrees "
-            f"and at most {MOST_UNCERTAIN_FOCAL:.1%}: add images in which the board leans to the left, the right, "
-            "forward and back, near the image's corners too"
-        )
     errors_px = dict(zip(views, errors[:, 0].tolist(), strict=True))
     worst = max(errors_px, key=lambda image: errors_px[image])
     if errors_px[worst] > LARGE_ERROR * width:
         raise CalibrationError(
             f"the reprojection error of {worst} is {errors_px[worst]:.2f} pixels, expected at most "
             f"{LARGE_ERROR * width:.1f}: remove it if it is blurred, or check the board's columns, rows and type"
+        )
+    if tilt < LEAST_TILT or not uncertainty < MOST_UNCERTAIN_FOCAL:
+        raise CalibrationError(
+            f"the images do not determine the intrinsics: the boards are tilted by at most {tilt:.0f} degrees to each "
+            f"other and the focal length is uncertain by {uncertainty:.1%}, expected at least {LEAST_TILT:.0f} degrees "
+            f"and at most {MOST_UNCERTAIN_FOCAL:.1%}: add images in which the board leans to the left, the right, "
+            "forward and back, near the image's corners too"
         )
     problems = calibration_problems(matrix, np.eye(4), height, width)
     if problems:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_symview.calibration.board import Board, board_pattern
+from lerobot_symview.calibration.board import Board, board_pattern, pixels_per_square
 from lerobot_symview.errors import OptionError
 
 FORMATS = (".pdf", ".png")
-DPI = 600  # about: squares and markers have a whole number of pixels
+DPI = 500, 650  # squares and markers have a whole number of pixels
 INCH = 0.0254  # metres
 MARGIN = 0.012  # metres: for the axes, the text, and the white border that detection needs
 PAPER = {f"A{size}": (0.841 * 2 ** (-size / 2), 1.189 * 2 ** (-size / 2)) for size in (4, 3, 2, 1, 0)}  # metres
@@ -29,7 +29,7 @@ class Print(NamedTuple):
 
 def board_print(board: Board) -> Print:
     """Return a page with the board at its true size, on the smallest of A4 to A0 that holds it."""
-    square = round(board.square / INCH * DPI)
+    square = pixels_per_square(board, *(round(board.square / INCH * dpi) for dpi in DPI))
     metre = square / board.square  # pixels
     pattern = board_pattern(board, square)
     size = np.array(pattern.shape) + round(2 * MARGIN * metre)
