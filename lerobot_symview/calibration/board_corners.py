@@ -26,7 +26,8 @@ WINDOW = 0.8  # squares: half the side of the window in which the pattern is ali
 LARGEST_SHIFT = 0.3  # squares
 LEAST_CORRELATION = 0.8  # of the pattern with the image; occluded corners have less
 LEAST_INSIDE = 0.7  # of the window's area
-LARGEST_SQUARE = 64  # pixels: enough for a hundredth of a pixel
+RENDERED_SQUARE = 96  # pixels
+BLURS = (0.4, 0.7, 1.0, 1.4, 2.0, 3.0)  # pixels, standard deviations
 ITERATIONS, CONVERGED = 20, 1e-3  # pixels
 
 
@@ -147,73 +148,81 @@ def _image_from_board(corners: Corners) -> Array:
 def _aligned(grey: NDArray, board: Board, corners: Corners) -> Corners:
     """Locate all corners of a board again, given some of them, and return those whose surroundings show the pattern.
 
-    The image is rectified to the pattern, and each corner's window is shifted to where it fits best (Lucas-Kanade).
+    The pattern is rendered into the image, and each corner's window is shifted to where it fits best (Lucas-Kanade).
     """
     image_from_board = _image_from_board(corners)
+    image = grey.astype(np.float32)
+    rendered = _rendered(board, image_from_board, image)
+    gradients = np.stack(np.gradient(rendered)[::-1])
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * WINDOW * board.square
+    places = cv2.perspectiveTransform(board.corners[None, :, :2], image_from_board)[0]
+    found, located = [], []
+    for index, (corner, place) in enumerate(zip(board.corners[:, :2], places, strict=True)):
+        outline = cv2.perspectiveTransform((corner + square)[None], image_from_board)[0]
+        first = np.maximum(np.floor(outline.min(axis=0)).astype(int), 0)
+        last = np.minimum(np.ceil(outline.max(axis=0)).astype(int), np.array(grey.shape[::-1]) - 1)
+        if (last < first).any():
+            continue
+        inside = np.zeros((last - first + 1)[::-1], np.uint8)
+        cv2.fillConvexPoly(inside, (outline - first).round().astype(np.int32), 1)
+        side = np.sqrt(cv2.contourArea(outline.astype(np.float32))) / (2 * WINDOW)  # pixels of a square
+        if inside.sum() < LEAST_INSIDE * (2 * WINDOW * side) ** 2:
+            continue
+        window = np.s_[first[1] : last[1] + 1, first[0] : last[0] + 1]
+        shift = _shift(rendered[window], gradients[:, *window], image, inside, (first + last) / 2)
+        if shift is not None and np.linalg.norm(shift) < LARGEST_SHIFT * side:
+            found.append(index)
+            located.append(place + shift)
+    return Corners(board.corners[found], np.array(located).reshape(-1, 2))
+
+
+def _rendered(board: Board, image_from_board: Array, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the image (H, W) of the board alone, as sharp as `image`, from the homography of its print."""
     outline = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]]) * board.size
     area = cv2.contourArea(cv2.perspectiveTransform(outline, image_from_board).astype(np.float32))
     in_image = board.square * np.sqrt(area / np.prod(board.size))  # pixels
-    square = int(np.clip(in_image, 8, LARGEST_SQUARE))
-    pattern = _pattern(board, square)
-    step = board.square / square  # metres per pixel of the pattern
-    board_from_pattern = np.array(
-        [[step, 0, (0.5 - square) * step], [0, -step, board.size[1] - (0.5 - square) * step], [0, 0, 1]]
+    samples = int(np.clip(round(RENDERED_SQUARE / max(in_image, 1)), 1, 4))  # per pixel and axis
+    side = pixels_per_square(board, RENDERED_SQUARE, 2 * RENDERED_SQUARE)
+    pattern = np.pad(board_pattern(board, side), side, constant_values=255).astype(np.float32)
+    step = board.square / side
+    edge = (0.5 - side) * step
+    board_from_pattern = np.array([[step, 0, edge], [0, -step, board.size[1] - edge], [0, 0, 1]])
+    fine_from_image = np.array([[samples, 0, (samples - 1) / 2], [0, samples, (samples - 1) / 2], [0, 0, 1]])
+    size = np.array(image.shape[::-1])
+    fine = cv2.warpPerspective(
+        cv2.GaussianBlur(pattern, (0, 0), max(0.5, side / (samples * in_image) / 2)),
+        fine_from_image @ image_from_board @ board_from_pattern,
+        samples * size,
+        borderValue=255,
     )
-    image_from_pattern = image_from_board @ board_from_pattern
-    shape, inverse = pattern.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    smooth = grey.astype(np.float32)
-    if in_image > square:  # the rectified image is coarser
-        smooth = cv2.GaussianBlur(smooth, (0, 0), in_image / square / 2)
-    rectified = cv2.warpPerspective(smooth, image_from_pattern, shape, flags=inverse)
-    inside = cv2.warpPerspective(np.ones(grey.shape, np.float32), image_from_pattern, shape, flags=inverse)
-    pattern, rectified = (cv2.GaussianBlur(image, (0, 0), 1.0) for image in (pattern, rectified))
-    gradients = np.stack(np.gradient(pattern)[::-1])
-    places = cv2.perspectiveTransform(board.corners[None, :, :2], np.linalg.inv(board_from_pattern))[0]
-    half = round(WINDOW * square)
-    found, located = [], []
-    for index, place in enumerate(places):
-        u, v = place.round().astype(int)
-        window = np.s_[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1]
-        if inside[window].mean() < LEAST_INSIDE:
-            continue
-        shift = _shift(pattern[window], gradients[:, *window], rectified, inside[window], window)
-        if shift is not None and np.linalg.norm(shift) < LARGEST_SHIFT * square:
-            found.append(index)
-            located.append(place + shift)
-    if not found:
-        return Corners(np.empty((0, 3)), np.empty((0, 2)))
-    pixels = cv2.perspectiveTransform(np.array(located)[None], image_from_pattern)[0]
-    return Corners(board.corners[found], pixels)
+    ideal = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+    mask = cv2.warpPerspective(
+        np.ones_like(pattern), image_from_board @ board_from_pattern, size, flags=cv2.INTER_NEAREST
+    )
+    candidates = [cv2.GaussianBlur(ideal, (0, 0), blur) for blur in BLURS]
+    seen = image[mask > 0]
+    return max(candidates, key=lambda candidate: float(np.corrcoef(candidate[mask > 0], seen)[0, 1]))
 
 
-def _pattern(board: Board, square: int) -> NDArray[np.float32]:
-    """Return the board's pattern with `square` pixels per square and a white border of one square.
-
-    It is reduced from a finer one: markers seldom have a whole number of pixels.
-    """
-    side = pixels_per_square(board, 192, 384)
-    fine = np.full((board.rows * side, board.columns * side), 255, dtype=np.float32)
-    pattern = board_pattern(board, side)
-    fine[: pattern.shape[0], : pattern.shape[1]] = pattern
-    reduced = cv2.resize(fine, (board.columns * square, board.rows * square), interpolation=cv2.INTER_AREA)
-    return np.pad(reduced, square, constant_values=255)
-
-
-def _shift(
-    template: NDArray, gradients: NDArray, image: NDArray, inside: NDArray, window: tuple[slice, slice]
-) -> Array | None:
+def _shift(template: NDArray, gradients: NDArray, image: NDArray, inside: NDArray, center: Array) -> Array | None:
     """Return how far the template's content is shifted in the image, (2,) pixels; None if it is not there.
 
     Brightness and contrast of the image are free: both are eliminated from the template's gradients.
+
+    Args:
+        template: (h, w) window of the rendered board.
+        gradients: (2, h, w) its derivatives along u and v.
+        image: (H, W) the image.
+        inside: (h, w) weights, 0 or 1.
+        center: u and v of the window's centre.
     """
-    weight = np.sqrt(inside).ravel()[:, None]
+    height, width = template.shape
+    weight = inside.ravel()[:, None].astype(np.float64)
     basis = np.linalg.qr(weight * np.column_stack([np.ones(template.size), template.ravel()]))[0]
     contrast = float(basis[:, 1] @ (weight[:, 0] * template.ravel()))
     slopes = weight * gradients.reshape(2, -1).T
     slopes -= basis @ (basis.T @ slopes)
     inverse = np.linalg.pinv(slopes)
-    height, width = template.shape
-    center = np.array([window[1].start + (width - 1) / 2, window[0].start + (height - 1) / 2])
     shift = np.zeros(2)
     for _ in range(ITERATIONS):
         sampled = cv2.getRectSubPix(image, (width, height), center + shift)
