@@ -69,6 +69,24 @@ def find_board(image: NDArray[np.uint8], board: Board) -> Corners:
     return corners
 
 
+def find_board_through_lens(image: NDArray[np.uint8], board: Board, matrix: Array, distortion: Array) -> Corners:
+    """Find the corners of a board as `find_board` does, in an image of a known lens.
+
+    Straight lines are straight in the undistorted image, in which the pattern fits around its corners; the corners are
+    returned in the pixels of `image`.
+
+    Args:
+        image: (H, W, 3) uint8 RGB or (H, W) uint8.
+        board: the board that the image should show.
+        matrix: (3, 3) K in pixels.
+        distortion: (N,) OpenCV's coefficients.
+    """
+    corners = find_board(cv2.undistort(image, matrix, distortion), board)
+    rays = np.column_stack([corners.pixels, np.ones(len(corners))]) @ np.linalg.inv(matrix).T
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, distortion)
+    return Corners(corners.board, pixels[:, 0])
+
+
 def _spans_plane(corners: Corners, board: Board) -> bool:
     if len(corners) < 4:
         return False

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.calibration.board import Board
-from lerobot_symview.calibration.board_corners import Corners, find_board
+from lerobot_symview.calibration.board_corners import Corners, find_board, find_board_through_lens
 from lerobot_symview.calibration.board_pose import (
     EstimatedIntrinsics,
     Intrinsics,
@@ -206,14 +206,15 @@ def _from_board(config: CalibrateConfig) -> Result:
         raise ValueError(f"--pose_image={pose_image} is none of the images: {', '.join(photographs)}")
     image = photographs[pose_image]
     height, width = image.shape[:2]
-    with flagged(f"{pose_image}, --board"):
-        corners = find_board(image, config.board)
     if config.intrinsics:
         intrinsics = _given_intrinsics(config, height, width)
     else:
+        with flagged(f"{pose_image}, --board"):
+            find_board(image, config.board)
         with flagged("--intrinsics, --images"):
-            views = _views(photographs, config.board) | {pose_image: corners}
-            intrinsics = _reported(estimate_intrinsics(views, height, width))
+            intrinsics = _reported(_estimated_intrinsics(photographs, config.board))
+    with flagged(f"{pose_image}, --board"):
+        corners = _find(image, config.board, intrinsics)
     with flagged(f"{pose_image}, --board, --intrinsics"):
         pose = board_pose(corners, intrinsics, width)
         camera = Camera(intrinsics.matrix, world_from_cam(pose, config.board.world_from_board), height, width)
@@ -228,15 +229,23 @@ def _from_board(config: CalibrateConfig) -> Result:
     return Result(camera, image, intrinsics.distortion, corners.pixels, caption)
 
 
-def _views(photographs: Photographs, board: Board) -> dict[str, Corners]:
-    """Return the corners in the images that show the board; the others are logged."""
+def _find(image: NDArray[np.uint8], board: Board, intrinsics: Intrinsics) -> Corners:
+    if not intrinsics.distortion.any():
+        return find_board(image, board)
+    return find_board_through_lens(image, board, intrinsics.matrix, intrinsics.distortion)
+
+
+def _estimated_intrinsics(photographs: Photographs, board: Board) -> EstimatedIntrinsics:
+    """Estimate the intrinsics, then find the corners through the lens and estimate again; log images without board."""
     views = {}
     for name, image in photographs.items():
         try:
             views[name] = find_board(image, board)
         except CalibrationError as error:
             logger.warning("%s is not used: %s", name, error)
-    return views
+    height, width = next(iter(photographs.values())).shape[:2]
+    first = estimate_intrinsics(views, height, width)
+    return estimate_intrinsics({name: _find(photographs[name], board, first) for name in views}, height, width)
 
 
 def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intrinsics:
