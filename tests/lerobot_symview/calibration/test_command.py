@@ -113,10 +113,10 @@ def test_several_photographs_give_intrinsics_and_distortion(run, photos):
     code, error, log = run(f"--images={photos}")
     assert (code, error) == (0, "")
     entry = yaml.safe_load(Path("cameras.yaml").read_text())["cameras"]["front"]
-    np.testing.assert_allclose(entry["intrinsics"], [615.3, 615.1, 319.5, 239.5], atol=2)
-    np.testing.assert_allclose(entry["distortion"], DISTORTION, atol=0.06)
-    assert pose_errors(CAMERA, np.array(entry["world_from_cam"]))[1] < 4
-    assert log.count("reprojection error") == 14
+    np.testing.assert_allclose(entry["intrinsics"], [615.3, 615.1, 319.5, 239.5], atol=0.7)
+    np.testing.assert_allclose(entry["distortion"], DISTORTION, atol=0.02)
+    assert pose_errors(CAMERA, np.array(entry["world_from_cam"]))[1] < 1
+    assert log.count("reprojection error") == 14  # thirteen views and the pose
     assert "intrinsics from 13 images" in log
 
 
