@@ -279,10 +279,12 @@ def _reason(grey: NDArray, board: Board, corners: int) -> str:
         name = _smallest(best, max(others[best]))
         return f"no {board} is visible; the image shows {len(others[best])} markers of dictionary {name}"
     if corners or ids:
+        old = board.type == "charuco" and board.rows % 2 == 0 and 2 * len(ids) > board.marker_count
+        hint = "; with an even number of rows, OpenCV before 4.6 printed another pattern" if old else ""
         return (
             f"the image shows {corners} of the {len(board.corners)} corners and {len(ids)} of the {board.marker_count} "
             f"markers of the {board}, at least {LEAST_CORNERS} corners are needed: move the board or the light, and "
-            "check its columns and rows"
+            f"check its columns and rows{hint}"
         )
     return f"no {board} and no other markers are visible: is it in the image, sharp and unmirrored?"
 

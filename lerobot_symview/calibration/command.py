@@ -38,7 +38,7 @@ from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.units import in_metres, parse_unit, unit_name
 from lerobot_symview.geometry.visibility import camera_problem, check_camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.runtime.cli import DatasetLocation, flagged, run_command
+from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 
 logger = logging.getLogger(__name__)
 
@@ -186,7 +186,12 @@ def _photographs(config: CalibrateConfig) -> Photographs:
     if config.dataset is not None:
         with flagged("--dataset, --camera, --episodes"):
             return from_dataset(config.dataset.folder(), config.camera, config.episodes, config.frames)
-    return {} if device is None else from_device(device, config.frames)
+    if device is None:
+        return {}
+    try:
+        return from_device(device, config.frames)
+    except (ImportError, RuntimeError) as error:  # LeRobot's cameras raise these, and OSError
+        raise CommandError(f"--device: {error}") from None
 
 
 def _first(photographs: Photographs) -> NDArray[np.uint8] | None:

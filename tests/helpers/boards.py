@@ -8,7 +8,7 @@ from lerobot_symview.calibration.board_corners import Corners
 from lerobot_symview.geometry.camera import Camera, orbit_pose, project, transform
 
 K = np.array([[615.3, 0, 319.5], [0, 615.1, 239.5], [0, 0, 1]])
-PRINT, SAMPLES = (56, 72), 3  # pixels per square of the print; samples per pixel and axis
+PRINT, SAMPLES = (56, 72), 2  # pixels per square of the print; samples per pixel and axis
 INK, PAPER, TABLE = 30, 235, 120  # grey levels
 
 

@@ -201,6 +201,13 @@ def test_another_board_is_named(shown, expected, match):
         find_board(photograph(shown, camera_over(shown, 70, 20, 0.5)), expected)
 
 
+def test_the_pattern_of_old_boards_is_refused():
+    old = Board()
+    old.aruco.setLegacyPattern(True)
+    with pytest.raises(CalibrationError, match=r"OpenCV before 4\.6 printed another pattern"):
+        find_board(photograph(old, camera_over(old, 70, 20, 0.5)), Board())
+
+
 def test_too_few_corners_are_refused():
     image = photograph(Board(), camera_over(Board(), 60, 20, 0.5))
     image[:, :370] = 90
@@ -239,10 +246,10 @@ def test_a_board_is_printed_at_its_true_size(name):
     board = BOARDS[name]
     with Image.open(io.BytesIO(encode_print(board_print(board), ".png"))) as png:
         dpi, page = png.info["dpi"][0], np.asarray(png.convert("L"))
-    small = cv2.resize(page, None, fx=1 / 6, fy=1 / 6, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(page, None, fx=1 / 12, fy=1 / 12, interpolation=cv2.INTER_AREA)
     corners = find_board(small, board)
     assert len(corners) == len(board.corners)
-    metres = (corners.pixels + 0.5) * 6 / dpi * 0.0254
+    metres = (corners.pixels + 0.5) * 12 / dpi * 0.0254
     difference = np.diff(metres - corners.board[:, :2] * [1, -1], axis=0)
     assert np.abs(difference).max() < 5e-5  # half a pixel of the print
 

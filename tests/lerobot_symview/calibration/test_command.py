@@ -233,6 +233,17 @@ def test_a_camera_of_lerobot_takes_the_image(run, monkeypatch):
     assert pose_errors(expected, read_calibration("cameras.yaml").camera("front").world_from_cam)[1] < 1
 
 
+def test_a_camera_that_fails_is_an_error_in_one_line(run, monkeypatch, tmp_path):
+    def fail(self):
+        raise RuntimeError("no frame arrived")
+
+    monkeypatch.setattr(FakeBoardCamera, "read", fail)
+    monkeypatch.setattr(this_package, "FakeBoardCamera", FakeBoardCamera, raising=False)
+    code, error, _ = run("--device.type=fake_board_camera", INTRINSICS)
+    assert (code, error) == (1, "symview-calibrate: error: --device: no frame arrived\n")
+    assert not list(tmp_path.iterdir())
+
+
 def tilted(camera, degrees, lift):
     """The camera with a pose that is wrong in tilt and height."""
     rotation, _ = cv2.Rodrigues(np.deg2rad([degrees, -0.5 * degrees, 0.0]))
