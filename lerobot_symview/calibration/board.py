@@ -133,7 +133,8 @@ class Board:
     def __str__(self) -> str:
         cells = "tags" if self.type == "apriltag" else "squares"
         name = f" ({self.dictionary_name})" if self.dictionary_name else ""
-        return f"{self.type} board of {self.columns} x {self.rows} {cells} of {1000 * self.square:g} mm{name}"
+        kind = self.type if self.type == "chessboard" else f"{self.type} board"
+        return f"{kind} of {self.columns} x {self.rows} {cells} of {1000 * self.square:g} mm{name}"
 
 
 def board_pattern(board: Board, square: int) -> NDArray[np.uint8]:
