@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ ALLOWED_HEIGHT, ALLOWED_TILT = 0.03, 5.0  # metres and degrees; beyond them the 
 REPORTED_HEIGHT, REPORTED_TILT = 0.01, 2.0  # beyond them a warning is given
 FEW, SOME, MOST = 0.1, 0.2, 0.5  # fractions of the valid pixels
 SPAN = 0.5  # of the workspace's side, along x and y: a smaller plane is an object or a link of the robot
+CORRECTED_HEIGHT, CORRECTED_TILT = 0.1, 10.0  # metres and degrees; a calibration that is farther off is another one
+LEVELLINGS = 3
 TRIES = 100
 
 
@@ -29,13 +31,18 @@ class TablePlane:
 
     Args:
         height: at the workspace's centre, metres above z = 0.
-        tilt: angle to z = 0, degrees.
+        slope: its rise along x and y, metres per metre.
         share: fraction of the valid pixels that lie on it.
     """
 
     height: float
-    tilt: float
+    slope: tuple[float, float]
     share: float
+
+    @property
+    def tilt(self) -> float:
+        """Angle to z = 0, degrees."""
+        return float(np.rad2deg(np.arctan(np.hypot(*self.slope))))
 
     @property
     def deviates(self) -> bool:
@@ -130,6 +137,57 @@ def check_table(
     return plane
 
 
+def levelled(depth: NDArray[np.floating], camera: Camera, workspace: Workspace) -> tuple[Camera, TablePlane]:
+    """Return the camera with the smallest change of its pose that puts the table in a depth image at z = 0.
+
+    The camera is tilted and moved along z; position and direction along the table come from the calibration.
+
+    Args:
+        depth: (H, W) float, metres; 0, negative or non-finite = invalid.
+        camera: its calibration, to about 10 cm and 10 degrees.
+        workspace: the square on the table.
+
+    Returns:
+        The camera, and the plane that the table had with the given calibration.
+
+    Raises:
+        CalibrationError: if the table is not visible, or farther from z = 0.
+    """
+    plane = first = _visible_plane(depth, camera, workspace)
+    if abs(first.height) > CORRECTED_HEIGHT or first.tilt > CORRECTED_TILT:
+        raise CalibrationError(
+            f"{first}, more than the {100 * CORRECTED_HEIGHT:.0f} cm and {CORRECTED_TILT:.0f}° that are corrected: "
+            f"{_cause(depth, camera, workspace, _rays(depth, camera, workspace), METRES)}"
+        )
+    for _ in range(LEVELLINGS):  # the corrected pose selects other pixels of the workspace
+        camera = replace(camera, world_from_cam=_level_from_plane(plane, workspace) @ camera.world_from_cam)
+        plane = _visible_plane(depth, camera, workspace)
+    return camera, first
+
+
+def _visible_plane(depth: NDArray, camera: Camera, workspace: Workspace) -> TablePlane:
+    rays = _rays(depth, camera, workspace)
+    plane = _largest_plane(rays, camera, workspace) if len(rays.depth) >= max(3, FEW * rays.count) else None
+    if plane is None:
+        raise CalibrationError(
+            "the depth image shows no plane in half of the workspace: is the table free, and the unit of depth right?"
+        )
+    return plane
+
+
+def _level_from_plane(plane: TablePlane, workspace: Workspace) -> Array:
+    """Return the smallest rigid motion (4, 4) that maps a plane to z = 0: a tilt about a point of it, and a lift."""
+    a, b = plane.slope
+    normal = np.array([-a, -b, 1.0]) / np.sqrt(1 + a**2 + b**2)
+    axis = np.array([normal[1], -normal[0], 0.0])  # normal x up, of length sin(tilt)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    level_from_plane = np.eye(4)
+    level_from_plane[:3, :3] += skew + skew @ skew / (1 + normal[2])
+    center = np.array([*workspace.center, plane.height])
+    level_from_plane[:3, 3] = [*workspace.center, 0.0] - level_from_plane[:3, :3] @ center
+    return level_from_plane
+
+
 def _rays(depth: NDArray, camera: Camera, workspace: Workspace) -> _Rays:
     step = max(1, int(np.sqrt(depth.size / RAYS)))
     v, u = np.mgrid[: camera.height : step, : camera.width : step]
@@ -162,7 +220,7 @@ def _largest_plane(rays: _Rays, camera: Camera, workspace: Workspace) -> TablePl
     if best.mean() < SOME or (high - low < SPAN * workspace.size).any():
         return None
     a, b, c = np.linalg.lstsq(design[best], points[best, 2], rcond=None)[0]
-    return TablePlane(float(c), float(np.rad2deg(np.arctan(np.hypot(a, b)))), float(best.mean()))
+    return TablePlane(float(c), (float(a), float(b)), float(best.mean()))
 
 
 def _cause(depth: NDArray, camera: Camera, workspace: Workspace, rays: _Rays, unit: float) -> str:

@@ -3,14 +3,19 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset, remove_feature
+from PIL import Image
 
 from lerobot_symview import keys
+from lerobot_symview.calibration.board import Board
+from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
+from tests.helpers.boards import close_views, photograph
 from tests.helpers.packages import temporary_registrations
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
@@ -33,6 +38,16 @@ def real_dataset(folder: Path) -> None:
     change_feature(folder, keys.STATE, names=joints)
     calibration = (block.text for block in blocks(ROOT / "docs" / "own_camera.md") if block.language == "yaml")
     Path("cameras.yaml").write_text(next(calibration))
+    photographs(Camera(np.reshape(camera.intrinsics, (3, 3)), np.reshape(pose, (4, 4)), 480, 640))
+
+
+def photographs(camera: Camera) -> None:
+    """Photograph a board on the table with the camera, and twelve times from nearby for the intrinsics."""
+    board, folder = Board(origin=(0.33, -0.08)), Path("photos")
+    folder.mkdir()
+    views = {"table": camera} | {str(index): view for index, view in enumerate(close_views(board))}
+    for name, view in views.items():
+        Image.fromarray(photograph(board, view)).save(folder / f"{name}.png")
 
 
 @pytest.fixture
