@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_symview.calibration.file import POSES, parse_calibration, parse_workspace
-from lerobot_symview.calibration.formats import FORMATS, CameraFacts, parse, recognise
+from lerobot_symview.calibration.formats import FORMATS, CameraFacts, Facts, Format, parse, recognise
 from lerobot_symview.calibration.formats.document import Document, read_document
 from lerobot_symview.calibration.formats.facts import Pose, Size
 from lerobot_symview.calibration.readings import PoseReading, resolve
@@ -54,11 +54,12 @@ def convert(
         raise CalibrationError("no calibration file is given")
     if len(documents) == 1:
         ((file, document),) = documents.items()
-        if _is_ours(document) or recognise(document) is None:
+        if _format(document) is None:
             return _our_content(file, document)
     units, named, workspaces, sources = "m", [], [], []
     for file, document in documents.items():
-        if _is_ours(document):
+        known = _format(document)
+        if known is None:
             content = _our_content(file, document)
             cameras = content.get("cameras")
             name, entries = _pick(file, cameras if isinstance(cameras, Mapping) else {}, camera)
@@ -66,7 +67,7 @@ def convert(
             units = content.get("units", "m") if "pose" in source.parts else units
             workspaces += [content["workspace"]] if content.get("workspace") is not None else []
         else:
-            name, facts = _pick(file, _read(file, document, size), camera)
+            name, facts = _pick(file, _read(file, document, known, size), camera)
             source = _from_facts(file, facts)
         sources.append(source)
         named += [name] if name else []
@@ -88,6 +89,11 @@ def _is_ours(document: Document) -> bool:
     return bool({"units", "cameras"} & set(document.entries()))
 
 
+def _format(document: Document) -> Format | None:
+    """Return the format of another tool's file; None for our own, and for a file of an unknown format."""
+    return None if _is_ours(document) else recognise(document)
+
+
 def _our_content(file: Path, document: Document) -> dict[str, Any]:
     """Return the content of our own file; raise an error for a file of an unknown format."""
     if document.problem:
@@ -102,11 +108,7 @@ def _our_content(file: Path, document: Document) -> dict[str, Any]:
     return content
 
 
-def _read(file: Path, document: Document, size: Size | None) -> dict[str, CameraFacts]:
-    known = recognise(document)
-    if known is None:
-        _our_content(file, document)
-        raise AssertionError
+def _read(file: Path, document: Document, known: Format, size: Size | None) -> Facts:
     try:
         return parse(document, known, size)
     except CalibrationError as error:
@@ -165,8 +167,8 @@ def _join(sources: Sequence[_Source], camera: str, size: Size | None) -> dict[st
                 )
             owner[part] = source
             joined |= entries
+    gives = ", ".join(owner) or "nothing"
     if "image size" not in owner and size is not None:
-        owner["image size"] = sources[0]
         joined |= {"height": size[0], "width": size[1]}
     files = " and ".join(str(source.file) for source in sources)
     missing = []
@@ -176,10 +178,9 @@ def _join(sources: Sequence[_Source], camera: str, size: Size | None) -> dict[st
         missing.append(
             f"no pose of the camera in the robot's base or the world: add a file with it, such as {HAS_POSE}"
         )
-    if "image size" not in owner:
+    if "height" not in joined or "width" not in joined:
         missing.append("no height and width of the image: add a file with them, such as ROS camera_info")
     if missing:
-        gives = ", ".join(owner) or "nothing"
         verb = "has" if len(sources) == 1 else "have"
         raise CalibrationError(f"{files} {verb} the {gives} of camera {camera!r}, but {'; and '.join(missing)}")
     return joined

@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 DIRECTIONS, ORDERS = (CAMERA_TO_BASE, BASE_TO_CAMERA), ("xyzw", "wxyz")
 AXES: dict[str, Array] = dict(zip((OPTICAL, OPENGL, ROS_LINK), NAMED_AXES.values(), strict=True))  # theirs_from_opencv
-LISTED = 12  # readings in a message
+FARTHEST = 20.0  # metres from the base: a longer translation is in millimetres
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def readings(pose: Pose, reading: PoseReading) -> dict[str, dict[str, Any]]:
 
     A description names what the file does not say.
     """
-    metres = METRES[reading.unit] if reading.unit else pose.metres
+    metres = _metres(pose, reading)
     orders: tuple[str | None, ...] = (None,)
     if pose.rotation.shape == (4,):
         orders = _possible(reading.quaternion_order or pose.quaternion_order, ORDERS)
@@ -68,16 +68,14 @@ def readings(pose: Pose, reading: PoseReading) -> dict[str, dict[str, Any]]:
         _possible(reading.direction or pose.direction, DIRECTIONS),
         _possible(reading.camera_axes or pose.axes, tuple(AXES)),
         orders,
-        _possible(metres, tuple(METRES.values())),
     )
-    units = {value: name for name, value in METRES.items()}
     found = {}
-    for direction, axes, order, unit in product(*choices):
-        names = (direction, f"{axes} axes", f"quaternion {order}", units.get(unit, ""))
+    for direction, axes, order in product(*choices):
+        names = (direction, f"{axes} axes", f"quaternion {order}")
         unsaid = [name for name, values in zip(names, choices, strict=True) if len(values) > 1]
         matrix = np.eye(4)
         matrix[:3, :3] = _matrix(pose.rotation, order)
-        matrix[:3, 3] = pose.translation * unit
+        matrix[:3, 3] = pose.translation * metres
         if direction == CAMERA_TO_BASE:
             matrix[:3, :3] = matrix[:3, :3] @ AXES[axes]
             found[", ".join(unsaid)] = {"world_from_cam": matrix.tolist()}
@@ -102,6 +100,8 @@ def resolve(
         ReadingError: if not exactly one reading sees the workspace; the message lists what each of them sees.
     """
     possible = readings(pose, reading)
+    if pose.metres is None and reading.unit is None and _metres(pose, reading) != METRES["m"]:
+        logger.info("camera %r: its position, %s, is read as millimetres", name, pose.translation)
     if len(possible) == 1:
         return next(iter(possible.values()))
     pinhole = {key: value for key, value in entries.items() if not key.startswith("distortion")}
@@ -122,12 +122,20 @@ def resolve(
         )
         return possible[sound[0]]
     listed = sound or sorted(cameras, key=lambda each: -workspace.visible_fraction(cameras[each]))
-    seen = "; ".join(f"{each}: {problems[each] or _seen(cameras[each], workspace)}" for each in listed[:LISTED])
+    seen = "; ".join(f"{each}: {problems[each] or _seen(cameras[each], workspace)}" for each in listed)
     count = f"{len(sound)} readings of its pose see" if sound else f"none of {len(possible)} readings of its pose sees"
     raise ReadingError(
         f"camera {name!r}: {count} the workspace of {workspace.size:g} m at {workspace.center}: {seen}; "
         "say which it is, or check the workspace"
     )
+
+
+def _metres(pose: Pose, reading: PoseReading) -> float:
+    """Return the metres per unit: of the reading, else of the file, else the unit with which the camera is near."""
+    if reading.unit is not None:
+        return METRES[reading.unit]
+    near = np.linalg.norm(pose.translation) <= FARTHEST
+    return pose.metres or (METRES["m"] if near else METRES["mm"])
 
 
 def _possible(known: Any, all_values: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -57,7 +57,7 @@ def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link"
         CalibrationError: if the content is invalid or has no such camera.
     """
     pose = _camera(content, name).world_from_cam
-    quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     return yaml.safe_dump(
         {
             "parameters": {
@@ -67,8 +67,8 @@ def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link"
                 "tracking_base_frame": f"{name}_optical_frame",
             },
             "transform": {
-                "translation": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
-                "rotation": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+                "translation": {axis: float(value) for axis, value in zip("xyz", pose[:3, 3], strict=True)},
+                "rotation": {"x": x, "y": y, "z": z, "w": w},
             },
         },
         sort_keys=False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,16 +48,14 @@ def read_document(file: Path | str) -> Document:
         with Path(file).open("rb") as stream:
             data = stream.read(LARGEST + 1)
         if len(data) > LARGEST:
-            raise CalibrationError(f"cannot read {file}: it has more than {LARGEST >> 20} MB, expected a calibration")
+            raise CalibrationError(f"has more than {LARGEST >> 20} MB, expected a calibration")
         if data.startswith((b"\x93NUMPY", b"PK\x03\x04")):
             return Document(content=_arrays(data))
         return parse_text(data.decode())
-    except (OSError, UnicodeDecodeError, MemoryError, EOFError, zipfile.BadZipFile) as error:
+    except CalibrationError as error:
+        raise CalibrationError(f"{file} {error}") from None
+    except (OSError, ValueError, MemoryError, EOFError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
         raise CalibrationError(f"cannot read {file}: {error}") from None
-    except CalibrationError:
-        raise
-    except (ValueError, KeyError, NotImplementedError) as error:
-        raise CalibrationError(f"cannot read {file} as NumPy's arrays: {error}") from None
 
 
 def parse_text(text: str) -> Document:
@@ -72,11 +71,13 @@ def parse_text(text: str) -> Document:
     try:
         if text.lstrip().startswith(("{", "[")):  # YAML 1.1 reads JSON's 1e-5 as a string
             return Document(text, json.loads(text))
-    except (ValueError, RecursionError):
+    except RecursionError:
+        return Document(text, problem="it is nested too deeply")
+    except ValueError:
         pass
     try:
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise CalibrationError("it has an alias (*name): write out the value it refers to")
+            raise CalibrationError("has an alias (*name): write out the value it refers to")
         return Document(text, yaml.safe_load(text))
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         if isinstance(error, CalibrationError):
@@ -89,7 +90,7 @@ def _arrays(data: bytes) -> Any:
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
-                raise ValueError(f"they have more than {LARGEST >> 20} MB")
+                raise CalibrationError(f"has more than {LARGEST >> 20} MB, expected a calibration")
     loaded = np.load(io.BytesIO(data), allow_pickle=False)
     if isinstance(loaded, np.ndarray):
         return loaded.tolist()

@@ -140,7 +140,7 @@ def lens(model: str | None, coefficients: ArrayLike) -> dict[str, Any]:
     Raises:
         CalibrationError: if the model is unknown or has another number of coefficients.
     """
-    values = np.asarray(coefficients, dtype=np.float64).ravel()
+    values: Array = np.asarray(coefficients, dtype=np.float64).ravel()
     if not np.isfinite(values).all():
         raise CalibrationError(f"distortion coefficients must be finite, got {values}")
     if not values.any():
@@ -207,8 +207,8 @@ def choose_size(blocks: Mapping[Size, Any], wanted: Size | None) -> tuple[Size, 
     Raises:
         CalibrationError: if it is not among several blocks; the message lists their sizes.
     """
-    if wanted in blocks:
-        return wanted, blocks[wanted]  # type: ignore[index]
+    if wanted is not None and wanted in blocks:
+        return wanted, blocks[wanted]
     if len(blocks) == 1:
         return next(iter(blocks.items()))
     sizes = ", ".join(f"{width} x {height}" for height, width in blocks)

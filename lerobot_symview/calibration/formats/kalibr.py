@@ -35,7 +35,7 @@ def _camera(entries: Mapping) -> CameraFacts:
     if entries["camera_model"] != "pinhole":
         raise CalibrationError(f"the camera model {entries['camera_model']!r} is not supported, expected pinhole")
     model = str(entries.get("distortion_model", "none"))
-    coefficients = [] if model == "none" else numbers("distortion_coeffs", entries["distortion_coeffs"], 4)
+    coefficients = numbers("distortion_coeffs", [0] * 4 if model == "none" else entries["distortion_coeffs"], 4)
     height, width = reversed(entries["resolution"])
     return CameraFacts(
         pinhole(*numbers("intrinsics", entries["intrinsics"], 4)),

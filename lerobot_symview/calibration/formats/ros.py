@@ -30,8 +30,10 @@ MODELS = {"radtan": PLUMB_BOB, "fisheye": EQUIDISTANT, "": None}
 
 def _is_camera_info(document: Document) -> bool:
     entries = document.entries()
-    file = "camera_matrix" in entries and ("image_width" in entries or "distortion_model" in entries)
-    return file or ("distortion_model" in entries and bool({"K", "k"} & set(entries)))
+    matrix = entries.get("camera_matrix")
+    has_lens = bool({"distortion_model", "distortion_coefficients", "projection_matrix"} & set(entries))
+    in_file = isinstance(matrix, Mapping) and "data" in matrix
+    return has_lens and (in_file or bool({"K", "k"} & set(entries)))
 
 
 def _camera_info(document: Document, size: Size | None) -> Facts:
