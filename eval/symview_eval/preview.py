@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.datasets.add_views import calibration_and_workspace, unit_from_flag, views_for_dataset
+from lerobot_symview.calibration.readings import PoseReading
+from lerobot_symview.datasets.add_views import (
+    POSE_FLAGS,
+    calibration_and_workspace,
+    unit_from_flag,
+    views_for_dataset,
+)
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
@@ -62,8 +68,11 @@ class PreviewConfig:
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
-    calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
+    calibration: Path | list[Path] | None = None
+    """File with the camera's calibration, for a dataset without one, or files that complete each other:
+    `[camera_info.yaml, handeye.calib]`; see docs/calibration_formats.md."""
+    pose: PoseReading = field(default_factory=PoseReading)
+    """How to read the calibration's pose; by default as its file says, else as the reading that sees the workspace."""
     depth_unit: str | None = None
     """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
     default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
@@ -188,7 +197,9 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
         if config.views is None and config.calibration is None:
             return None, {}
         raise ValueError(f"the dataset has no camera {config.camera!r}: check --camera")
-    calibration, workspace = calibration_and_workspace(config.calibration, config.workspace, source.features)
+    calibration, workspace = calibration_and_workspace(
+        config.calibration, config.workspace, source.features, config.camera, config.pose
+    )
     options: dict[str, View] = {"reproj": config.reproj, "persp": config.persp}
     specs = config.views
     if specs is None:
@@ -306,4 +317,4 @@ def _displayable(image: NDArray) -> NDArray[np.uint8]:
 
 def main() -> None:
     """Run the console command."""
-    run_command(PreviewConfig, preview, EXAMPLES, short={"--root": "--dataset.root"})
+    run_command(PreviewConfig, preview, EXAMPLES, short={"--root": "--dataset.root", **POSE_FLAGS})

@@ -25,10 +25,10 @@ The file is YAML or JSON:
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +36,9 @@ from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
+
+if TYPE_CHECKING:
+    from lerobot_symview.calibration.readings import PoseReading
 
 logger = logging.getLogger(__name__)
 
@@ -70,26 +73,34 @@ class Calibration:
         return self.cameras[name]
 
 
-def read_calibration(file: Path | str) -> Calibration:
-    """Read a calibration file in the format described at the top of this module.
+def read_calibration(
+    files: Path | str | Sequence[Path | str],
+    camera: str | None = None,
+    size: tuple[int, int] | None = None,
+    workspace: Workspace | None = None,
+    reading: PoseReading | None = None,
+) -> Calibration:
+    """Read a calibration file in the format described at the top of this module, or files of other tools.
+
+    Args:
+        files: a file, or several that complete each other, such as one with K and one with a pose.
+        camera: the camera's name, for files of other tools.
+        size: rows and columns of its images, for files that do not say it.
+        workspace: what the camera sees, to decide between readings of a pose.
+        reading: how to read the pose, in place of what the file says.
 
     Raises:
-        CalibrationError: if the file cannot be read as YAML or JSON, or its content is invalid; one message lists all
-            problems.
+        CalibrationError: if a file cannot be read, its content is invalid, or something is missing; one message lists
+            all problems.
     """
-    import yaml
+    from lerobot_symview.calibration.convert import convert  # the formats are converted to that of this module
 
-    try:
-        text = Path(file).read_text()
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
-            raise CalibrationError(f"{file} has an alias (*name): write out the value it refers to")
-        content = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise CalibrationError(f"cannot read {file}: {error}") from None
+    listed = [files] if isinstance(files, Path | str) else list(files)
+    content = convert(listed, camera, size, workspace, reading)
     try:
         calibration = parse_calibration(content)
     except CalibrationError as error:
-        raise CalibrationError(f"{file}: {error}") from None
+        raise CalibrationError(f"{' and '.join(map(str, listed))}: {error}") from None
     _warn_of_resized(calibration)
     return calibration
 

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
+from lerobot_symview.calibration.readings import PoseReading, ReadingError
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.derivation import (
     Derivation,
@@ -43,7 +44,13 @@ EXAMPLES = """\
       --new_repo_id=me/picking_reproj --new_root=data/picking_reproj --views='[reproj]' --size=76 --keep='[]'
   symview-add-views --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --num_workers=4 \\
       --reproj.clip=0.15 --reproj.source_scale=2
+  symview-add-views --dataset.repo_id=me/real --calibration='[camera_info.yaml, handeye.calib]' --camera=front
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/stock --size=76 --for_stock_policies=true"""
+POSE_FLAGS = {
+    "--pose_direction": "--pose.direction",
+    "--quaternion_order": "--pose.quaternion_order",
+    "--camera_axes": "--pose.camera_axes",
+}
 
 
 @dataclass(frozen=True)
@@ -66,8 +73,11 @@ class AddViewsConfig:
     """Options of the view reproj."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view persp."""
-    calibration: Path | None = None
-    """YAML or JSON file with the camera's calibration, for a dataset without one; see docs/own_camera.md."""
+    calibration: Path | list[Path] | None = None
+    """File with the camera's calibration, for a dataset without one, or files that complete each other:
+    `[camera_info.yaml, handeye.calib]`; see docs/calibration_formats.md."""
+    pose: PoseReading = field(default_factory=PoseReading)
+    """How to read the calibration's pose; by default as its file says, else as the reading that sees the workspace."""
     depth_unit: str | None = None
     """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
     default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
@@ -163,11 +173,13 @@ def _check_apart(source: Path, target: Path) -> None:
 
 
 def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:
-    calibration, workspace = calibration_and_workspace(config.calibration, config.workspace, source.features)
+    calibration, workspace = calibration_and_workspace(
+        config.calibration, config.workspace, source.features, config.camera, config.pose
+    )
     views = views_for_dataset(config.make_views(), source.features)
     added: Features = {}
     if calibration is not None:
-        with flagged(f"--calibration={config.calibration}"):
+        with flagged(f"--calibration={_listed(config.calibration)}"):
             check_camera(config.camera, calibration.camera(config.camera), workspace)
         added |= calibration_features(config.camera)
     for name, view in views.items():
@@ -200,14 +212,32 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
 
 
 def calibration_and_workspace(
-    file: Path | None, workspace: Workspace | None, features: Features
+    files: Path | list[Path] | None, workspace: Workspace | None, features: Features, camera: str, pose: PoseReading
 ) -> tuple[Calibration | None, Workspace]:
-    """Return the calibration of `file`, and the workspace: the argument, else the file's, else the dataset's."""
-    if file is None:
+    """Return the calibration of `files`, and the workspace: the argument, else the file's, else the dataset's."""
+    if files is None:
         return None, workspace or stored_workspace(features)
-    with flagged("--calibration"):
-        calibration = read_calibration(file)
+    shown = workspace or stored_workspace(features)
+    try:
+        with flagged("--calibration"):
+            calibration = read_calibration(files, camera, _image_size(features, camera), shown, pose)
+    except ReadingError as error:
+        raise ReadingError(f"{error}; {', '.join(POSE_FLAGS)} and --pose.unit decide") from None
     return calibration, workspace or calibration.workspace or stored_workspace(features)
+
+
+def _image_size(features: Features, camera: str) -> tuple[int, int] | None:
+    """Return rows and columns of a camera's images; None if the dataset has none."""
+    feature = features.get(keys.rgb(camera))
+    if feature is None:
+        return None
+    shape = feature["shape"]
+    height, width = shape[1:] if shape[0] in (1, 3) else shape[:2]
+    return height, width
+
+
+def _listed(files: Path | list[Path] | None) -> str:
+    return ", ".join(map(str, files)) if isinstance(files, list) else str(files)
 
 
 def unit_from_flag(depth_unit: str | None) -> float | None:
@@ -279,4 +309,4 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
 
 def main() -> None:
     """Run the console command."""
-    run_command(AddViewsConfig, add_views, EXAMPLES, short={"--root": "--dataset.root"})
+    run_command(AddViewsConfig, add_views, EXAMPLES, short={"--root": "--dataset.root", **POSE_FLAGS})

@@ -1,0 +1,90 @@
+"""Cameras of our own calibration file as files of ROS: camera_info and easy_handeye2."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from lerobot_symview.calibration.file import parse_calibration
+from lerobot_symview.calibration.formats.facts import PLUMB_BOB, lens
+from lerobot_symview.geometry.camera import Camera
+
+
+def camera_info(content: Mapping[str, Any], name: str) -> str:
+    """Return the YAML of ROS's camera_info: image size, K and lens of a camera.
+
+    Args:
+        content: of our own calibration file, as `convert` and `plain_calibration` return it.
+        name: the camera's name.
+
+    Raises:
+        CalibrationError: if the content is invalid or has no such camera.
+    """
+    camera = _camera(content, name)
+    entries = content["cameras"][name]
+    distortion = lens(entries.get("distortion_model"), entries.get("distortion") or [])
+    coefficients = list(distortion.get("distortion", [0.0] * 5))
+    projection = np.column_stack([camera.intrinsics, np.zeros(3)])
+    return yaml.safe_dump(
+        {
+            "image_width": camera.width,
+            "image_height": camera.height,
+            "camera_name": name,
+            "camera_matrix": _matrix(camera.intrinsics),
+            "distortion_model": distortion.get("distortion_model", PLUMB_BOB),
+            "distortion_coefficients": _matrix(np.array([coefficients])),
+            "rectification_matrix": _matrix(np.eye(3)),
+            "projection_matrix": _matrix(projection),
+        },
+        sort_keys=False,
+        default_flow_style=None,
+    )
+
+
+def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link") -> str:
+    """Return the YAML of easy_handeye2: the pose of a camera beside the table, with optical axes.
+
+    Args:
+        content: of our own calibration file, as `convert` and `plain_calibration` return it.
+        name: the camera's name.
+        base: name of the world's frame.
+
+    Raises:
+        CalibrationError: if the content is invalid or has no such camera.
+    """
+    pose = _camera(content, name).world_from_cam
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    return yaml.safe_dump(
+        {
+            "parameters": {
+                "name": name,
+                "calibration_type": "eye_on_base",
+                "robot_base_frame": base,
+                "tracking_base_frame": f"{name}_optical_frame",
+            },
+            "transform": {
+                "translation": {axis: float(value) for axis, value in zip("xyz", pose[:3, 3], strict=True)},
+                "rotation": {"x": x, "y": y, "z": z, "w": w},
+            },
+        },
+        sort_keys=False,
+        default_flow_style=None,
+    )
+
+
+def _camera(content: Mapping[str, Any], name: str) -> Camera:
+    """Return the camera without its lens."""
+    cameras = {
+        each: {key: value for key, value in entries.items() if not key.startswith("distortion")}
+        for each, entries in content["cameras"].items()
+    }
+    return parse_calibration({**content, "cameras": cameras}).camera(name)
+
+
+def _matrix(matrix: np.ndarray) -> dict[str, Any]:
+    rows, columns = matrix.shape
+    return {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}
