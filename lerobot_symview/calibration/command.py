@@ -1,4 +1,4 @@
-"""`symview-calibrate`: finds a camera's pose and intrinsics from images of a printed board on the table."""
+"""`symview-calibrate`: a camera's pose and intrinsics from images of a printed board, or from other tools' files."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from lerobot_symview.calibration.board_pose import (
     world_from_cam,
 )
 from lerobot_symview.calibration.board_print import board_print, encode_print
+from lerobot_symview.calibration.convert import convert
 from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration, read_calibration
 from lerobot_symview.calibration.photographs import (
     Photographs,
@@ -32,12 +33,15 @@ from lerobot_symview.calibration.photographs import (
     from_files,
 )
 from lerobot_symview.calibration.picture import calibration_picture
+from lerobot_symview.calibration.readings import POSE_FLAGS, PoseReading, ReadingError
 from lerobot_symview.calibration.table_plane import levelled, likely_depth_unit
+from lerobot_symview.calibration.writers import WRITERS
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.units import in_metres, parse_unit, unit_name
 from lerobot_symview.geometry.visibility import camera_problem, check_camera
 from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 
 logger = logging.getLogger(__name__)
@@ -48,7 +52,9 @@ EXAMPLES = """\
   symview-calibrate --images=photo.jpg --camera=front --intrinsics=615.3,615.1,319.5,239.5 --board.origin='[0.3, -0.1]'
   symview-calibrate --dataset.repo_id=me/real --camera=front --episodes='[0]' --frames=20
   symview-calibrate --device.type=opencv --device.index_or_path=0 --camera=front --frames=12
-  symview-calibrate --calibration=cameras.yaml --refine=table --dataset.repo_id=me/real --camera=front"""
+  symview-calibrate --calibration=cameras.yaml --refine=table --dataset.repo_id=me/real --camera=front
+  symview-calibrate --convert='[camera_info.yaml, handeye.calib]' --camera=front --output=cameras.yaml
+  symview-calibrate --convert='[cameras.yaml]' --camera=front --to=camera_info --output=camera_info.yaml"""
 
 
 @dataclass(frozen=True)
@@ -92,12 +98,24 @@ class CalibrateConfig:
     """Depth image of the table for `refine`, a 16-bit PNG, a TIFF or a .npy; by default the dataset's first frame."""
     depth_unit: str | None = None
     """Unit of depth: m, mm, or metres per unit; by default the dataset's, or the one that shows the table at z = 0."""
+    convert: list[Path] = field(default_factory=list)
+    """Calibration files of other tools, which complete each other, to write in place of a calibration from images."""
+    pose: PoseReading = field(default_factory=PoseReading)
+    """How to read the pose in `convert`; by default as its file says, else as the reading that sees the workspace."""
+    image_size: tuple[int, int] | None = None
+    """Rows and columns of the camera's images, for files in `convert` that do not say them."""
+    to: str = ""
+    """Format of the output of `convert`, `camera_info` or `easy_handeye2`; by default our own."""
     output: Path = Path("cameras.yaml")
     """Calibration file to write; other cameras in it are kept."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:
             raise ValueError(f"--frames must be at least 1, got {self.frames}")
+        if self.to:
+            lookup("--to", self.to, WRITERS)
+        if self.to and not self.convert:
+            raise ValueError("--to is the format that --convert writes: give both")
         if self.refine not in ("", "table"):
             raise ValueError(f"--refine must be table, got {self.refine!r}")
         if self.calibration is not None and not self.refine:
@@ -120,6 +138,7 @@ class Result:
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     corners: Array | None = None
     caption: str = ""
+    depth_unit: float | None = None
 
 
 def calibrate(config: CalibrateConfig) -> Path:
@@ -130,6 +149,8 @@ def calibrate(config: CalibrateConfig) -> Path:
     """
     if config.board.print is not None:
         return _print(config.board, config.board.print)
+    if config.convert:
+        return _convert(config)
     known = _existing(config.output)
     workspace = config.workspace or known.workspace or _about(config.board)
     if config.calibration is None:
@@ -145,6 +166,28 @@ def calibrate(config: CalibrateConfig) -> Path:
     elif problem := camera_problem(result.camera, workspace):
         logger.warning("camera %r %s: give --workspace.center and --workspace.size", config.camera, problem)
     return _write(config, known, workspace, result)
+
+
+def _convert(config: CalibrateConfig) -> Path:
+    """Write the files of other tools in our format, or in that of `to`."""
+    known = Calibration({}) if config.to else _existing(config.output)
+    given = config.workspace or known.workspace
+    with flagged("--convert"):
+        try:
+            content = convert(config.convert, config.camera, config.image_size, given or Workspace(), config.pose)
+        except ReadingError as error:
+            raise ReadingError(f"{error}; {', '.join(POSE_FLAGS)} and --pose.unit decide") from None
+    if config.to:
+        _replace(config.output, WRITERS[config.to](content, config.camera))
+        logger.info("wrote %s", config.output)
+        return config.output
+    with flagged("--convert"):
+        read = parse_calibration(content)
+        camera = read.camera(config.camera)
+    workspace = given or read.workspace or Workspace()
+    if problem := camera_problem(camera, workspace):
+        logger.warning("camera %r %s: give --workspace.center and --workspace.size", config.camera, problem)
+    return _write(config, known, workspace, Result(camera, depth_unit=read.depth_units.get(config.camera)))
 
 
 def _print(board: Board, file: Path) -> Path:
@@ -322,8 +365,9 @@ def _write(config: CalibrateConfig, known: Calibration, workspace: Workspace, re
         "intrinsics": np.round([camera.fx, camera.fy, camera.cx, camera.cy], 4).tolist(),
         "world_from_cam": camera.world_from_cam.round(7).tolist(),
     }
-    if config.camera in known.depth_units:
-        entry["depth_unit"] = known.depth_units[config.camera]
+    depth_unit = result.depth_unit or known.depth_units.get(config.camera)
+    if depth_unit is not None:
+        entry["depth_unit"] = depth_unit
     content = {
         "units": "m",
         "workspace": asdict(workspace) | {"center": list(workspace.center)},
@@ -337,14 +381,20 @@ def _write(config: CalibrateConfig, known: Calibration, workspace: Workspace, re
     if result.rgb is not None:
         files.append(config.output.with_name(f"{config.output.stem}_{config.camera}.png"))
         _picture(config, workspace, result).save(files[-1])
-    part = config.output.with_name(config.output.name + ".partial")
-    part.write_text(_yaml(content))
-    part.replace(config.output)
+    _replace(config.output, _yaml(content))
     x, y, z = camera.position
     logger.info(
         "camera %r is at x %.3f, y %.3f, z %.3f m; wrote %s", config.camera, x, y, z, " and ".join(map(str, files))
     )
     return config.output
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write a file at once."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(file.name + ".partial")
+    part.write_text(text)
+    part.replace(file)
 
 
 def _picture(config: CalibrateConfig, workspace: Workspace, result: Result) -> Any:
@@ -388,4 +438,9 @@ def _with_device() -> type[CalibrateConfig]:
 def main() -> None:
     """Run the console command."""
     live = any(argument.startswith("--device") for argument in sys.argv)
-    run_command(_with_device() if live else CalibrateConfig, calibrate, EXAMPLES, short={"--root": "--dataset.root"})
+    run_command(
+        _with_device() if live else CalibrateConfig,
+        calibrate,
+        EXAMPLES,
+        short={"--root": "--dataset.root", **POSE_FLAGS},
+    )

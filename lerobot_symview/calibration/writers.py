@@ -57,7 +57,7 @@ def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link"
         CalibrationError: if the content is invalid or has no such camera.
     """
     pose = _camera(content, name).world_from_cam
-    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+    x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
     return yaml.safe_dump(
         {
             "parameters": {
@@ -88,3 +88,7 @@ def _camera(content: Mapping[str, Any], name: str) -> Camera:
 def _matrix(matrix: np.ndarray) -> dict[str, Any]:
     rows, columns = matrix.shape
     return {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}
+
+
+WRITERS = {"camera_info": camera_info, "easy_handeye2": easy_handeye2}
+"""Name of a format -> writer of a camera in it."""

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
-from lerobot_symview.calibration.readings import PoseReading, ReadingError
+from lerobot_symview.calibration.readings import POSE_FLAGS, PoseReading, ReadingError
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.derivation import (
     Derivation,
@@ -46,11 +46,6 @@ EXAMPLES = """\
       --reproj.clip=0.15 --reproj.source_scale=2
   symview-add-views --dataset.repo_id=me/real --calibration='[camera_info.yaml, handeye.calib]' --camera=front
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/stock --size=76 --for_stock_policies=true"""
-POSE_FLAGS = {
-    "--pose_direction": "--pose.direction",
-    "--quaternion_order": "--pose.quaternion_order",
-    "--camera_axes": "--pose.camera_axes",
-}
 
 
 @dataclass(frozen=True)

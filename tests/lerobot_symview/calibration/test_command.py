@@ -23,6 +23,7 @@ from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from tests.helpers.boards import K, camera_over, close_views, photograph, pose_errors
 from tests.helpers.cameras import plane_depth
+from tests.lerobot_symview.calibration.formats import files
 
 INTRINSICS = "--intrinsics=615.3,615.1,319.5,239.5"
 DISTORTION = (-0.2, 0.08, 0.001, -0.0005)
@@ -308,3 +309,36 @@ def test_a_dataset_gives_depth_and_the_picture(run, recorded, tmp_path):
     assert "episode 0, frame 0, --board: no charuco board" in error
     code, error, _ = run(*flags, "--episodes=[7]")
     assert "there is no episode 7" in error
+
+
+def test_files_of_other_tools_are_converted_and_written_back(run, tmp_path):
+    without_lens = files.camera_info(distortion_coefficients=files.matrix([[0.0] * 5]), distortion_model="plumb_bob")
+    (tmp_path / "k.yaml").write_text(without_lens)
+    (tmp_path / "pose.calib").write_text(files.handeye2())
+    code, error, _ = run("--convert=[k.yaml, pose.calib]", "--camera=front")
+    assert code == 0, error
+    camera = read_calibration(tmp_path / "cameras.yaml").camera("front")
+    np.testing.assert_allclose(camera.world_from_cam, files.BASE_FROM_CAMERA, atol=1e-6)
+    for to, name in (("camera_info", "back.yaml"), ("easy_handeye2", "back.calib")):
+        assert run("--convert=[cameras.yaml]", "--camera=front", f"--to={to}", f"--output={name}")[0] == 0
+    again = read_calibration([tmp_path / "back.yaml", tmp_path / "back.calib"], "front").camera("front")
+    np.testing.assert_allclose(again.world_from_cam, camera.world_from_cam, atol=1e-6)
+    np.testing.assert_allclose(again.intrinsics, camera.intrinsics, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--convert=[k.yaml]"], "no pose of the camera in the robot's base or the world: add a file"),
+        (["--convert=[k.yaml]", "--to=kalibr"], "--to 'kalibr'"),
+        (["--to=camera_info"], "--to is the format that --convert writes"),
+        (["--convert=[missing.yaml]"], "missing.yaml"),
+    ],
+)
+def test_what_cannot_be_converted_is_an_error_in_one_line(run, tmp_path, flags, message):
+    (tmp_path / "k.yaml").write_text(files.camera_info())
+    code, error, _ = run(*flags)
+    assert code
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "cameras.yaml").exists()
