@@ -87,7 +87,7 @@ def depth_from_file(file: Path) -> NDArray:
     try:
         if file.suffix != ".npy":
             return decode_depth(file.read_bytes())
-        depth = np.load(file, allow_pickle=False)
+        depth = np.load(file)
     except (OSError, ValueError) as error:
         raise CalibrationError(f"{file}: {error}") from None
     if depth.ndim != 2:

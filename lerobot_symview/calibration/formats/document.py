@@ -91,7 +91,7 @@ def _arrays(data: bytes) -> Any:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(member.file_size for member in archive.infolist()) > LARGEST:
                 raise CalibrationError(f"has more than {LARGEST >> 20} MB, expected a calibration")
-    loaded = np.load(io.BytesIO(data), allow_pickle=False)
+    loaded = np.load(io.BytesIO(data))
     if isinstance(loaded, np.ndarray):
         return loaded.tolist()
     return {name: loaded[name].tolist() for name in loaded.files}
