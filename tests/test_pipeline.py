@@ -56,7 +56,7 @@ def test_every_stage_writes_its_result(tiny_demo):
 def test_report_is_self_contained(tiny_demo):
     page = (tiny_demo.output_dir / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
-    assert page.count("data:video/mp4;base64,") == 2
+    assert page.count("data:video/mp4;base64,") == 4  # two episodes of each evaluation
     assert page.count("data:image/svg+xml;base64,") == 1
     for command in ("symview-generate", "symview-add-views", "lerobot-train", "lerobot-eval"):
         assert f"<pre>{command} " in page

@@ -195,11 +195,10 @@ class SymviewConfig(PreTrainedConfig):
                 "--policy.gripper_input=image draws a top-down image of the gripper, which does not fit "
                 "--policy.view=side: use --policy.gripper_input=vector, or --policy.method=sideview_equi for both"
             )
-        if self.camera_rays and (self.view.name, self.encoder, self.augmentation) != ("side", "plain", "none"):
+        if self.camera_rays and (self.view.name, self.encoder) != ("side", "plain"):
             raise ValueError(
-                "--policy.camera_rays=true gives the rays of the camera's own image, which do not rotate with it: use "
-                "--policy.view=side, --policy.encoder=plain and --policy.augmentation=none, got "
-                f"{self.view.name}, {self.encoder} and {self.augmentation}"
+                "--policy.camera_rays=true gives the rays of the camera's own image, which are no scalars: use "
+                f"--policy.view=side and --policy.encoder=plain, got {self.view.name} and {self.encoder}"
             )
         missing = [label for label in keys.STATE_NAMES if label not in self.state_symmetry]
         if self.gripper_input == "image" and missing:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.workspace import Workspace
 
 
@@ -39,3 +40,14 @@ def plucker_rays(
     center = pose.new_tensor([*workspace.center, 0.0])
     moment = torch.linalg.cross((pose[:, :3, 3] - center)[:, None, None].expand_as(direction), direction)
     return torch.cat([direction, moment], dim=-1).permute(0, 3, 1, 2).float()
+
+
+def transformed_rays(rays: Tensor, transform: PlanarTransform) -> Tensor:
+    """Return the rays (B, 6, h, w) of the same pixels after a planar transform of the scene and its camera.
+
+    Directions are vectors; moments are axial vectors, which a reflection negates besides.
+    """
+    dx, dy, dz, mx, my, mz = rays.unbind(dim=1)
+    sign = transform.determinant[:, None, None]
+    mx, my = transform.apply(sign * mx, sign * my)
+    return torch.stack([*transform.apply(dx, dy), dz, mx, my, sign * mz], dim=1)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.clouds import POINTS, cloud_from_depth
-from lerobot_policy_symview.inputs.rays import plucker_rays
+from lerobot_policy_symview.inputs.rays import plucker_rays, transformed_rays
 from lerobot_policy_symview.inputs.state import camera_directions
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
@@ -151,12 +151,14 @@ class ImageInput(SceneInput):
     ) -> tuple[Tensor, Tensor]:
         """Return images (B, C, crop, crop) and states (B, N)."""
         images, state = self._images(batch), self._state(batch, transform)
+        if self.config.camera_rays:
+            rays = self._rays(batch, images)
+            rays = rays if transform is None else transformed_rays(rays, transform)
+            images = torch.cat([images, rays], dim=1)
         if transform is not None:
             images = transform_images(images, transform)
         if self.config.gripper_input == "image":
             images = torch.cat([images, self._gripper(state, images.shape[-1])[:, None]], dim=1)
-        if self.config.camera_rays:
-            images = torch.cat([images, self._rays(batch, images)], dim=1)
         return crop(images, self.config.crop_size, crop_offset), state
 
     def downscale(self, images: Tensor) -> Tensor:

@@ -5,8 +5,9 @@ import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 
-from lerobot_policy_symview.inputs.rays import plucker_rays
+from lerobot_policy_symview.inputs.rays import plucker_rays, transformed_rays
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import unproject
 from lerobot_symview.geometry.workspace import Workspace
@@ -51,6 +52,21 @@ def test_a_downscaled_pixel_has_the_ray_of_its_centre():
     whole, half = rays(camera), rays(camera, size=(camera.height // 2, camera.width // 2))
     mean = torch.nn.functional.avg_pool2d(whole, 2)
     torch.testing.assert_close(half, mean, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("reflects", [False, True])
+@pytest.mark.parametrize("angle", [0.0, 0.7, np.pi / 2])
+def test_rays_transform_with_the_scene_and_its_camera(angle, reflects):
+    camera = make_camera(40, 15)
+    c, s = np.cos(angle), np.sin(angle)
+    linear = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([1, -1 if reflects else 1, 1])
+    pose = camera.world_from_cam.copy()
+    pose[:3, :3], pose[:3, 3] = linear @ pose[:3, :3], CENTER + linear @ (pose[:3, 3] - CENTER)
+    size = (camera.height, camera.width)
+    k = torch.from_numpy(camera.intrinsics.reshape(1, 9))
+    moved = plucker_rays(k, torch.from_numpy(pose.reshape(1, 16)), size, size, WORKSPACE)
+    transform = PlanarTransform(torch.tensor([angle], dtype=torch.float32), torch.tensor([reflects]))
+    torch.testing.assert_close(transformed_rays(rays(camera), transform), moved, atol=1e-5, rtol=0)
 
 
 def test_stored_observations_have_the_rays_of_the_cameras_images():
