@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lerobot_symview.calibration.file import Calibration as Calibration
-    from lerobot_symview.calibration.file import read_calibration as read_calibration
+    from lerobot_symview.calibration.read import read_calibration as read_calibration
     from lerobot_symview.datasets.add_views import AddViewsConfig as AddViewsConfig
     from lerobot_symview.datasets.add_views import add_views as add_views
     from lerobot_symview.datasets.hub import HubDataset as HubDataset
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from lerobot_symview.views import warp_table as warp_table
 
 _NAMES_OF_MODULE = {
-    "calibration.file": ("Calibration", "read_calibration"),
+    "calibration.file": ("Calibration",),
+    "calibration.read": ("read_calibration",),
     "datasets.add_views": ("AddViewsConfig", "add_views"),
     "datasets.hub": ("HubDataset",),
     "errors": ("CalibrationError", "DatasetError", "DivergenceError", "OptionError", "SymviewError"),

@@ -9,6 +9,7 @@ import numpy as np
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import TRIES, CameraSpec
+from lerobot_symview.geometry.visibility import table_rays
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.rendering import render
 
@@ -49,13 +50,7 @@ def place_in_sight(
 def seen_fraction(client: Any, camera: Camera, workspace: Workspace) -> float:
     """Return the fraction of the workspace's pixels in a camera's image that do not show the robot; 0 without any."""
     camera = resized(camera, PIXELS)
-    v, u = np.mgrid[: camera.height, : camera.width]
-    in_camera = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    rays = in_camera @ camera.world_from_cam[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        distance = -camera.position[2] / rays[..., 2]
-        offset = camera.position[:2] + distance[..., None] * rays[..., :2] - workspace.center
-        inside = (rays[..., 2] < 0) & (np.abs(offset) <= workspace.size / 2).all(axis=-1)
+    _, _, inside = table_rays(camera, workspace)
     labels = render(client, camera, labelled=True).labels
     assert labels is not None
     return float((labels[inside] != ROBOT).mean()) if inside.any() else 0.0

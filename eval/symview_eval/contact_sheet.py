@@ -17,7 +17,7 @@ from lerobot_symview.geometry.workspace import Workspace
 TILE, GAP, LABEL = 228, 8, 24  # pixels
 LINE = 1.5  # pixels of a tile: width of an outline, whatever the size of the image
 OUTLINE, CEILING = (255, 60, 0), (255, 190, 0)  # RGB of the workspace's border on the table and at its height limit
-BORDER_POINTS = 32  # per side of the workspace; segments that reach behind the camera are not drawn
+LINE_POINTS = 32  # per line in space; segments that reach behind the camera are not drawn
 
 
 @dataclass(frozen=True)
@@ -57,31 +57,46 @@ def page(title: str, rows: list[SheetRow], warnings: list[str]) -> str:
     return environment.get_template("preview.html").render(title=title, rows=embedded, warnings=warnings, tile=TILE)
 
 
-def with_outline(rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace) -> NDArray[np.uint8]:
+def with_outline(
+    rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace, longest: int = 2 * TILE
+) -> NDArray[np.uint8]:
     """Draw the workspace's border on the table (red) and at its height limit (yellow) into a camera's image.
 
     Args:
         rgb: (H, W, 3) uint8.
         camera: the camera of the image.
         workspace: the workspace.
+        longest: pixels to which the longer side of a smaller image is about enlarged.
 
     Returns:
-        The image, enlarged by a whole number if it is small, (s H, s W, 3) uint8.
+        The image, enlarged by a whole number, (s H, s W, 3) uint8.
     """
-    scale = max(1, round(2 * TILE / max(rgb.shape[:2])))
+    scale = max(1, round(longest / max(rgb.shape[:2])))
     image = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
     draw = ImageDraw.Draw(image)
     width = max(2, round(LINE * max(image.size) / TILE))
     for height, color in ((workspace.height_limit, CEILING), (0.0, OUTLINE)):
         corners = workspace.corners(height)
-        share = np.linspace(0, 1, BORDER_POINTS)[:, None]
-        border = np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)])
-        pixels, depth = project(border, camera)
-        points = [tuple(point) for point in (pixels + 0.5) * scale]
-        for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
-            if near > 0 and far > 0:
-                draw.line([first, second], fill=color, width=width)
+        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            draw_line(draw, camera, scale, start, end, color, width)
     return np.asarray(image)
+
+
+def draw_line(
+    draw: ImageDraw.ImageDraw,
+    camera: Camera,
+    scale: int,
+    start: NDArray[np.floating],
+    end: NDArray[np.floating],
+    color: tuple[int, int, int],
+    width: int,
+) -> None:
+    """Draw a line in space, from `start` to `end` (3,), into a camera's image that is enlarged by `scale`."""
+    pixels, depth = project(start + np.linspace(0, 1, LINE_POINTS)[:, None] * (end - start), camera)
+    points = [tuple(point) for point in ((pixels + 0.5) * scale).tolist()]
+    for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
+        if near > 0 and far > 0:
+            draw.line([first, second], fill=color, width=width)
 
 
 def grey(metres: NDArray[np.floating]) -> NDArray[np.uint8]:

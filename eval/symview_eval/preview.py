@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.readings import POSE_FLAGS, PoseReading
+from lerobot_symview.calibration.readings import PoseReading
 from lerobot_symview.datasets.add_views import (
+    POSE_FLAGS,
     calibration_and_workspace,
     unit_from_flag,
     views_for_dataset,

@@ -25,10 +25,9 @@ The file is YAML or JSON:
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,16 +36,12 @@ from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
 
-if TYPE_CHECKING:
-    from lerobot_symview.calibration.readings import PoseReading
-
 logger = logging.getLogger(__name__)
 
 METRES = {"m": 1.0, "mm": 0.001}
 REQUIRED = ("height", "width", "intrinsics")
 POSES = ("world_from_cam", "cam_from_world", "position")
 OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion", "distortion_model")
-OFF_CENTER = 0.2  # of the image's side: distance of the principal point from the middle
 ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
 UNDISTORT = (
     "lens distortion is not supported: undistort the images when recording, "
@@ -71,38 +66,6 @@ class Calibration:
         if name not in self.cameras:
             raise CalibrationError(f"the calibration has no camera {name!r}; it has {', '.join(self.cameras)}")
         return self.cameras[name]
-
-
-def read_calibration(
-    files: Path | str | Sequence[Path | str],
-    camera: str | None = None,
-    size: tuple[int, int] | None = None,
-    workspace: Workspace | None = None,
-    reading: PoseReading | None = None,
-) -> Calibration:
-    """Read a calibration file in the format described at the top of this module, or files of other tools.
-
-    Args:
-        files: a file, or several that complete each other, such as one with K and one with a pose.
-        camera: the camera's name, for files of other tools.
-        size: rows and columns of its images, for files that do not say it.
-        workspace: what the camera sees, to decide between readings of a pose.
-        reading: how to read the pose, in place of what the file says.
-
-    Raises:
-        CalibrationError: if a file cannot be read, its content is invalid, or something is missing; one message lists
-            all problems.
-    """
-    from lerobot_symview.calibration.convert import convert  # the formats are converted to that of this module
-
-    listed = [files] if isinstance(files, Path | str) else list(files)
-    content = convert(listed, camera, size, workspace, reading)
-    try:
-        calibration = parse_calibration(content)
-    except CalibrationError as error:
-        raise CalibrationError(f"{' and '.join(map(str, listed))}: {error}") from None
-    _warn_of_resized(calibration)
-    return calibration
 
 
 def parse_calibration(content: Any) -> Calibration:
@@ -198,22 +161,6 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
     return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
-
-
-def _warn_of_resized(calibration: Calibration) -> None:
-    """Warn of principal points far from the middle: K is often that of another image size, or never calibrated."""
-    for name, camera in calibration.cameras.items():
-        x, y = abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5)
-        if max(x, y) > OFF_CENTER:
-            logger.warning(
-                "camera %r: the principal point (%.4g, %.4g) is far from the middle of the %d x %d image: "
-                "are the intrinsics those of another image size?",
-                name,
-                camera.cx,
-                camera.cy,
-                camera.width,
-                camera.height,
-            )
 
 
 def _intrinsics(value: Any) -> Array:

@@ -22,12 +22,6 @@ logger = logging.getLogger(__name__)
 
 DIRECTIONS, ORDERS = (CAMERA_TO_BASE, BASE_TO_CAMERA), ("xyzw", "wxyz")
 AXES: dict[str, Array] = dict(zip((OPTICAL, OPENGL, ROS_LINK), NAMED_AXES.values(), strict=True))  # theirs_from_opencv
-POSE_FLAGS = {
-    "--pose_direction": "--pose.direction",
-    "--quaternion_order": "--pose.quaternion_order",
-    "--camera_axes": "--pose.camera_axes",
-}
-"""Short flags of the commands that read poses -> the fields of their `PoseReading`."""
 FARTHEST = 20.0  # metres from the base: a longer translation is in millimetres
 
 

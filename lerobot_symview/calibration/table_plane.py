@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.units import METRES, unit_name
-from lerobot_symview.geometry.visibility import camera_problem, read_differently
+from lerobot_symview.geometry.visibility import camera_problem, read_differently, table_rays
 from lerobot_symview.geometry.workspace import Workspace
 
 CAMERA_UNITS = (1.0, 0.001, 0.0001, 0.00025)  # metres, millimetres, RealSense D405, RealSense L515
@@ -190,13 +190,7 @@ def _level_from_plane(plane: TablePlane, workspace: Workspace) -> Array:
 
 def _rays(depth: NDArray, camera: Camera, workspace: Workspace) -> _Rays:
     step = max(1, int(np.sqrt(depth.size / RAYS)))
-    v, u = np.mgrid[: camera.height : step, : camera.width : step]
-    in_camera = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    directions = in_camera @ camera.world_from_cam[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        expected = -camera.position[2] / directions[..., 2]
-        offset = camera.position[:2] + expected[..., None] * directions[..., :2] - workspace.center
-        inside = (directions[..., 2] < 0) & (np.abs(offset) <= workspace.size / 2).all(axis=-1)
+    directions, expected, inside = table_rays(camera, workspace, step)
     measured = depth[::step, ::step]
     valid = inside & np.isfinite(measured) & (measured > 0)
     return _Rays(directions[valid], expected[valid], measured[valid].astype(np.float64), int(inside.sum()))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
@@ -12,8 +14,9 @@ from typing import Any
 from tqdm import tqdm
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
-from lerobot_symview.calibration.readings import POSE_FLAGS, PoseReading, ReadingError
+from lerobot_symview.calibration.file import Calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
+from lerobot_symview.calibration.readings import PoseReading, ReadingError
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
 from lerobot_symview.datasets.derivation import (
     Derivation,
@@ -23,7 +26,13 @@ from lerobot_symview.datasets.derivation import (
     source_fingerprint,
     write_part,
 )
-from lerobot_symview.datasets.features import Features, calibration_features, stored_workspace, view_features
+from lerobot_symview.datasets.features import (
+    Features,
+    calibration_features,
+    image_size,
+    stored_workspace,
+    view_features,
+)
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, gripper_dimensions
@@ -46,6 +55,13 @@ EXAMPLES = """\
       --reproj.clip=0.15 --reproj.source_scale=2
   symview-add-views --dataset.repo_id=me/real --calibration='[camera_info.yaml, handeye.calib]' --camera=front
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/stock --size=76 --for_stock_policies=true"""
+
+POSE_FLAGS = {
+    "--pose_direction": "--pose.direction",
+    "--quaternion_order": "--pose.quaternion_order",
+    "--camera_axes": "--pose.camera_axes",
+}
+"""Short flags of the commands that read poses -> the fields of their `PoseReading`."""
 
 
 @dataclass(frozen=True)
@@ -213,22 +229,19 @@ def calibration_and_workspace(
     if files is None:
         return None, workspace or stored_workspace(features)
     shown = workspace or stored_workspace(features)
-    try:
-        with flagged("--calibration"):
-            calibration = read_calibration(files, camera, _image_size(features, camera), shown, pose)
-    except ReadingError as error:
-        raise ReadingError(f"{error}; {', '.join(POSE_FLAGS)} and --pose.unit decide") from None
+    with pose_flagged("--calibration"):
+        calibration = read_calibration(files, camera, image_size(features, keys.rgb(camera)), shown, pose)
     return calibration, workspace or calibration.workspace or stored_workspace(features)
 
 
-def _image_size(features: Features, camera: str) -> tuple[int, int] | None:
-    """Return rows and columns of a camera's images; None if the dataset has none."""
-    feature = features.get(keys.rgb(camera))
-    if feature is None:
-        return None
-    shape = feature["shape"]
-    height, width = shape[1:] if shape[0] in (1, 3) else shape[:2]
-    return height, width
+@contextmanager
+def pose_flagged(flag: str) -> Iterator[None]:
+    """Prefix errors of a calibration with its flag; where the reading of its pose is open, name the flags for that."""
+    try:
+        with flagged(flag):
+            yield
+    except ReadingError as error:
+        raise ReadingError(f"{error}; {', '.join(POSE_FLAGS)} and --pose.unit decide") from None
 
 
 def _listed(files: Path | list[Path] | None) -> str:

@@ -84,6 +84,15 @@ def declared_unit(feature: dict[str, Any]) -> float | None:
     return None if unit is None else UNIT_NAMES[unit]
 
 
+def image_size(features: Features, key: str) -> tuple[int, int] | None:
+    """Return rows and columns of an image feature, declared with channels first or last; None without the feature."""
+    if key not in features:
+        return None
+    shape = features[key]["shape"]
+    height, width = shape[1:] if shape[0] in (1, 3) else shape[:2]
+    return height, width
+
+
 def check_depth_size(camera: str, depth: Sequence[int], color: Sequence[int]) -> None:
     """Raise a DatasetError unless the depth images of a camera have the size of its colour images.
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid, project
@@ -83,6 +84,28 @@ def camera_problem(
             f"it is {np.linalg.norm(camera.position - [*workspace.center, 0]):.3g} m away"
         )
     return None
+
+
+def table_rays(camera: Camera, workspace: Workspace, step: int = 1) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return the rays of every `step`-th pixel of an image, and which of them meet the workspace's square on z = 0.
+
+    Args:
+        camera: gives the image's size.
+        workspace: the square.
+        step: rows and columns from one pixel to the next.
+
+    Returns:
+        (h, w, 3) world directions of depth 1; (h, w) depth at which they meet the table, metres; (h, w) whether they
+        meet the square.
+    """
+    v, u = np.mgrid[: camera.height : step, : camera.width : step]
+    in_camera = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    directions = in_camera @ camera.world_from_cam[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -camera.position[2] / directions[..., 2]
+        offset = camera.position[:2] + depth[..., None] * directions[..., :2] - workspace.center
+        inside = (directions[..., 2] < 0) & (np.abs(offset) <= workspace.size / 2).all(axis=-1)
+    return directions, depth, inside
 
 
 def workspace_pixels(camera: Camera, workspace: Workspace) -> float:

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from lerobot_policy_symview.rl.demonstrations import open_dataset
-from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.runtime.cli import DatasetLocation

@@ -10,7 +10,7 @@ import torch
 from safetensors import SafetensorError
 
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import SymviewError
 from tests.malicious.files import saved_replay
 

@@ -159,7 +159,7 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
     )
     try:
         last_checkpoint(config)
-    except CommandError as error:  # no checkpoint yet, or one with other settings
+    except CommandError as error:  # no checkpoint yet, or one of another version's settings
         logger.info("%s: training starts from the beginning: %s", cell, error)
         shutil.rmtree(job.output, ignore_errors=True)
         config = replace(config, resume=False)

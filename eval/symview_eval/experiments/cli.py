@@ -91,12 +91,12 @@ def run_experiment(name: str, config: ExperimentConfig) -> list[Cell]:
     """
     scale = SCALES[config.scale]
     finished = finished_results(config.results_dir, config.scale)
-    costs = Costs.measured(finished.values())
+    costs = Costs.measured(finished)
     cells = chosen_cells(name, scale, config.tasks, config.methods, config.demos, config.seeds, costs)
     logger.info("%s", "all tables and figures" if name == ALL else f"{EXPERIMENTS[name].title}, {name}")
     logger.info("scale: %s", scale)
     os.environ["HF_HUB_OFFLINE"] = "1"
-    missing = unfinished_cells(cells, config.results_dir, finished)
+    missing = unfinished_cells(cells, finished)
     for line in remaining(cells, missing, costs):
         logger.info("%s", line)
     if config.dry_run:

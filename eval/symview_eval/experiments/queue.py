@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lerobot_symview.registry import lookup
 from symview_eval.experiments.grid import EXPERIMENTS, Cell, Experiment, select
-from symview_eval.experiments.results import read_result
+from symview_eval.experiments.results import Result
 from symview_eval.experiments.scale import Scale
 from symview_sim.tasks import TASK_NAMES
 
@@ -25,12 +25,12 @@ class Costs:
     medians: dict[tuple[str, ...], float] = field(default_factory=dict)
 
     @classmethod
-    def measured(cls, results: Iterable[Path]) -> Costs:
-        """Return the costs of finished results; `<table>/<scale>/<task>/<method>/<demonstrations>/<seed>.csv`."""
+    def measured(cls, finished: dict[Path, Result]) -> Costs:
+        """Return the costs of `finished_results`."""
         seconds: dict[tuple[str, ...], list[float]] = {}
-        for path in results:
-            table, _, task, row = path.parts[-6:-2]  # the experiment, its scale, …
-            cell_seconds = read_result(path).times.cpu_s
+        for path, result in finished.items():
+            table, _, task, row = path.parts[:4]  # as in `Cell.path`
+            cell_seconds = result.times.cpu_s
             if cell_seconds > 0 and row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
                 for key in _keys(EXPERIMENTS[table], rows[row].policy["method"], task):
                     seconds.setdefault(key, []).append(cell_seconds)

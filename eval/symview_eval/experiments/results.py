@@ -127,34 +127,28 @@ def read_result(path: Path) -> Result:
         ) from None
 
 
-def unfinished_cells(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> list[Cell]:
-    """Return the cells whose configuration has no result, in any table.
+def finished_results(folder: Path, scale: str) -> dict[Path, Result]:
+    """Return the results of a scale, by their files relative to `folder`."""
+    return {path.relative_to(folder): read_result(path) for path in sorted(folder.glob(f"*/{scale}/*/*/*/*.csv"))}
 
-    Args:
-        cells: the cells to check.
-        folder: folder of all results.
-        configurations: configuration hash -> file, for every existing result.
-    """
-    unfinished = [cell for cell in cells if cell.configuration_hash not in configurations]
-    for path in (folder / cell.path for cell in unfinished):
-        if path.exists():
-            logger.info("%s has another configuration and is run again", path)
+
+def unfinished_cells(cells: Iterable[Cell], finished: dict[Path, Result]) -> list[Cell]:
+    """Return the cells whose configuration has no result, in any table; `finished` is that of `finished_results`."""
+    known = {result.origin.configuration for result in finished.values()}
+    unfinished = [cell for cell in cells if cell.configuration_hash not in known]
+    for cell in unfinished:
+        if cell.path in finished:
+            logger.info("%s has another configuration and is run again", cell.path)
     return unfinished
 
 
-def copy_shared(cells: Iterable[Cell], folder: Path, configurations: dict[str, Path]) -> None:
-    """Copy results to the cells of other tables that have the same configuration; arguments as above."""
+def copy_shared(cells: Iterable[Cell], folder: Path, finished: dict[Path, Result]) -> None:
+    """Write the results of other tables for the cells that have the same configuration."""
+    known = {result.origin.configuration: result for result in finished.values()}
     for cell in cells:
-        path, existing = folder / cell.path, configurations.get(cell.configuration_hash)
-        if existing is None or (path.exists() and read_result(path).origin.configuration == cell.configuration_hash):
-            continue
-        logger.debug("%s is copied from %s, which has the same configuration", path, existing)
-        write_result(path, read_result(existing))
-
-
-def finished_results(folder: Path, scale: str) -> dict[str, Path]:
-    """Return configuration hash -> result file, for all results of a scale."""
-    return {read_result(path).origin.configuration: path for path in sorted(folder.glob(f"*/{scale}/*/*/*/*.csv"))}
+        own, shared = finished.get(cell.path), known.get(cell.configuration_hash)
+        if shared is not None and (own is None or own.origin.configuration != cell.configuration_hash):
+            write_result(folder / cell.path, shared)
 
 
 def _text(value: float | str) -> str:

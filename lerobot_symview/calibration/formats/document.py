@@ -6,6 +6,7 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,13 @@ class Document:
             content = value
         return {str(key): value for key, value in content.items()} if isinstance(content, dict) else {}
 
+    def cameras(self, has: Callable[[Mapping[str, Any]], bool]) -> dict[str, Mapping[str, Any]]:
+        """Return name -> entries of the cameras for which `has` is true; the empty name for entries at the top."""
+        entries = self.entries()
+        if has(entries):
+            return {"": entries}
+        return {name: value for name, value in entries.items() if isinstance(value, Mapping) and has(value)}
+
 
 def read_document(file: Path | str) -> Document:
     """Return the content of a calibration file of any format.
@@ -54,7 +62,7 @@ def read_document(file: Path | str) -> Document:
         return parse_text(data.decode())
     except CalibrationError as error:
         raise CalibrationError(f"{file} {error}") from None
-    except (OSError, ValueError, MemoryError, EOFError, NotImplementedError, zlib.error, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         raise CalibrationError(f"cannot read {file}: {error}") from None
 
 
@@ -86,12 +94,21 @@ def parse_text(text: str) -> Document:
 
 
 def _arrays(data: bytes) -> Any:
-    """Return the array of a .npy file as lists, or name -> array of a .npz file."""
-    if data.startswith(b"PK"):
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > LARGEST:
-                raise CalibrationError(f"has more than {LARGEST >> 20} MB, expected a calibration")
-    loaded = np.load(io.BytesIO(data))
-    if isinstance(loaded, np.ndarray):
-        return loaded.tolist()
-    return {name: loaded[name].tolist() for name in loaded.files}
+    """Return the array of a .npy file as lists, or name -> array of a .npz file.
+
+    Raises:
+        ValueError: if the file is malformed.
+    """
+    try:
+        if data.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                if sum(member.file_size for member in archive.infolist()) > LARGEST:
+                    raise CalibrationError(f"has more than {LARGEST >> 20} MB, expected a calibration")
+        loaded = np.load(io.BytesIO(data))
+        if isinstance(loaded, np.ndarray):
+            return loaded.tolist()
+        return {name: loaded[name].tolist() for name in loaded.files}
+    except (EOFError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(str(error)) from None
+    except NotImplementedError as error:  # of zipfile: a compression that Python lacks, or encryption
+        raise ValueError(f"{error}: save it with np.savez") from None

@@ -22,13 +22,16 @@ from lerobot_symview.errors import CalibrationError
 MODELS = {"radtan": PLUMB_BOB, "equidistant": EQUIDISTANT}
 
 
+def _has_model(entries: Mapping) -> bool:
+    return "camera_model" in entries
+
+
 def _recognises(document: Document) -> bool:
-    return any(isinstance(value, Mapping) and "camera_model" in value for value in document.entries().values())
+    return bool(document.cameras(_has_model))
 
 
 def _parse(document: Document, size: Size | None) -> Facts:
-    cameras = {name: value for name, value in document.entries().items() if isinstance(value, Mapping)}
-    return {name: _camera(value) for name, value in cameras.items() if "camera_model" in value}
+    return {name: _camera(entries) for name, entries in document.cameras(_has_model).items()}
 
 
 def _camera(entries: Mapping) -> CameraFacts:

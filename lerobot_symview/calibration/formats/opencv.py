@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -59,7 +60,7 @@ def _file_storage(document: Document, size: Size | None) -> Facts:
     if facts.pose is None and len(poses) > 1:
         raise CalibrationError(f"it has several 4 x 4 matrices: {', '.join(poses)}; keep the camera's pose")
     pose = matrix_pose(poses[0], entries[poses[0]], axes=OPTICAL) if poses else facts.pose
-    return {"": _with_pose(facts, pose)}
+    return {"": replace(facts, pose=pose)}
 
 
 def _node(node: cv2.FileNode) -> Any:
@@ -93,7 +94,10 @@ def _data(value: Any) -> Any:
 
 def _facts(entries: Mapping[str, Any]) -> CameraFacts:
     lower = {name.lower(): value for name, value in entries.items() if value is not None}
-    pick: Callable[[tuple[str, ...]], Any] = lambda names: next((lower[name] for name in names if name in lower), None)  # noqa: E731
+
+    def pick(names: tuple[str, ...]) -> Any:
+        return next((lower[name] for name in names if name in lower), None)
+
     matrix, coefficients, rotation, translation = map(pick, (MATRIX, COEFFICIENTS, ROTATION, TRANSLATION))
     size = optional_size({"height": pick(HEIGHT), "width": pick(WIDTH)})
     pose = None
@@ -109,10 +113,6 @@ def _facts(entries: Mapping[str, Any]) -> CameraFacts:
         pose=pose,
         **lens(EQUIDISTANT if fisheye else None, [] if coefficients is None else coefficients),
     )
-
-
-def _with_pose(facts: CameraFacts, pose: Pose | None) -> CameraFacts:
-    return CameraFacts(facts.intrinsics, facts.size, facts.distortion, facts.distortion_model, pose)
 
 
 def _is_umi(document: Document) -> bool:

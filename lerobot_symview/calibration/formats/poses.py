@@ -28,15 +28,7 @@ from lerobot_symview.calibration.formats.facts import (
 from lerobot_symview.errors import CalibrationError
 
 DIRECTIONS = {"transform_camera_to_world": CAMERA_TO_BASE, "transform_world_to_camera": BASE_TO_CAMERA}
-ROTATIONS, TRANSLATIONS = ("rotation_matrix",), ("translation_vector", "translation")
-
-
-def _cameras(document: Document, has: Callable[[Mapping[str, Any]], bool]) -> dict[str, Mapping[str, Any]]:
-    """Return name -> entries of the cameras with what is looked for; the empty name for entries at the top."""
-    entries = document.entries()
-    if has(entries):
-        return {"": entries}
-    return {name: value for name, value in entries.items() if isinstance(value, Mapping) and has(value)}
+TRANSLATIONS = ("translation_vector", "translation")
 
 
 def _has_droid(entries: Mapping[str, Any]) -> bool:
@@ -46,7 +38,7 @@ def _has_droid(entries: Mapping[str, Any]) -> bool:
 def _droid(document: Document, size: Size | None) -> Facts:
     """`pose`: x, y, z in metres and extrinsic Euler angles x, y, z in radians, from the camera to the robot's base."""
     facts = {}
-    for name, entries in _cameras(document, _has_droid).items():
+    for name, entries in document.cameras(_has_droid).items():
         x, y, z, *angles = numbers("pose", entries["pose"], 6)
         rotation = Rotation.from_euler("xyz", angles).as_matrix()
         facts[name] = CameraFacts(pose=Pose(rotation, np.array([x, y, z]), CAMERA_TO_BASE, OPTICAL, None, 1.0))
@@ -60,7 +52,7 @@ def _has_transform(entries: Mapping[str, Any]) -> bool:
 def _transform(document: Document, size: Size | None) -> Facts:
     """`transform_camera_to_world` with `intrinsics` beside it; other copies of the matrix are not read."""
     facts = {}
-    for name, entries in _cameras(document, _has_transform).items():
+    for name, entries in document.cameras(_has_transform).items():
         key = next(key for key in DIRECTIONS if key in entries)
         pose = matrix_pose(key, entries[key], DIRECTIONS[key], metres=1.0)
         intrinsics, values = None, entries.get("intrinsics")
@@ -77,7 +69,7 @@ def _has_quaternion(entries: Mapping[str, Any]) -> bool:
 
 def _quaternion(document: Document, size: Size | None) -> Facts:
     facts = {}
-    for name, entries in _cameras(document, _has_quaternion).items():
+    for name, entries in document.cameras(_has_quaternion).items():
         direction = CAMERA_TO_BASE if "base_frame_id" in entries else None
         rotation, translation = numbers("quat", entries["quat"], 4), numbers("pos", entries["pos"], 3)
         facts[name] = CameraFacts(pose=Pose(rotation, translation, direction))
@@ -90,7 +82,7 @@ def _has_rotation(entries: Mapping[str, Any]) -> bool:
 
 def _rotation(document: Document, size: Size | None) -> Facts:
     facts = {}
-    for name, entries in _cameras(document, _has_rotation).items():
+    for name, entries in document.cameras(_has_rotation).items():
         key = next(key for key in TRANSLATIONS if key in entries)
         rotation = numbers("rotation_matrix", entries["rotation_matrix"], 3, 3)
         facts[name] = CameraFacts(pose=Pose(rotation, numbers(key, entries[key], 3)))
@@ -133,7 +125,7 @@ def _is_number(word: str) -> bool:
 
 
 def _recogniser(has: Callable[[Mapping[str, Any]], bool]) -> Callable[[Document], bool]:
-    return lambda document: bool(_cameras(document, has))
+    return lambda document: bool(document.cameras(has))
 
 
 DROID = Format("DROID", _recogniser(_has_droid), _droid)

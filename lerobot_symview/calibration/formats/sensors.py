@@ -21,15 +21,14 @@ from lerobot_symview.calibration.formats.facts import (
     choose_size,
     image_size,
     lens,
-    matrix_pose,
     number,
     numbers,
     pinhole,
 )
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.units import MILLIMETRES
 
-MILLIMETRES = 1e-3
 REALSENSE_MODELS = {"brown conrady": PLUMB_BOB, "kannala brandt4": EQUIDISTANT}
 ZED_SIZES = {
     "2K": (1242, 2208), "FHD": (1080, 1920), "FHD1200": (1200, 1920), "HD": (720, 1280), "SVGA": (600, 960),
@@ -98,13 +97,7 @@ def _color_from_depth(entries: Mapping[str, Any]) -> Array:
     color_from_depth = np.eye(4)
     color_from_depth[:3, :3] = numbers("depth_to_color rotation", entries["rotation"], 3, 3)
     color_from_depth[:3, 3] = numbers("depth_to_color translation", entries["translation"], 3) * MILLIMETRES
-    return _rigid(color_from_depth)
-
-
-def _rigid(matrix: Array) -> Array:
-    """Return a rigid transform (4, 4) after the checks of poses."""
-    matrix_pose("depth_to_color", matrix)
-    return matrix
+    return color_from_depth
 
 
 def _is_azure(document: Document) -> bool:

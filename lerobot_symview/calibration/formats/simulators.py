@@ -26,24 +26,22 @@ from lerobot_symview.calibration.formats.facts import (
 )
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, intrinsics_from_fov
+from lerobot_symview.geometry.units import MILLIMETRES
 
 MUJOCO = {"cam_xpos", "cam_xmat", "cam_fovy"}
 SAPIEN = {"extrinsic_cv", "cam2world_gl", "intrinsic_cv"}
 
 
-def _has_matrices(value: Any) -> bool:
-    return isinstance(value, Mapping) and bool((MUJOCO | SAPIEN) & set(value))
+def _has_matrices(entries: Mapping[str, Any]) -> bool:
+    return bool((MUJOCO | SAPIEN) & set(entries))
 
 
-def _cameras(document: Document) -> dict[str, Mapping[str, Any]]:
-    entries = document.entries()
-    if _has_matrices(entries):
-        return {"": entries}
-    return {name: value for name, value in entries.items() if _has_matrices(value)}
+def _is_simulated(document: Document) -> bool:
+    return bool(document.cameras(_has_matrices))
 
 
 def _simulated(document: Document, size: Size | None) -> Facts:
-    return {name: _camera(entries, size) for name, entries in _cameras(document).items()}
+    return {name: _camera(entries, size) for name, entries in document.cameras(_has_matrices).items()}
 
 
 def _camera(entries: Mapping[str, Any], size: Size | None) -> CameraFacts:
@@ -86,8 +84,8 @@ def _bop(document: Document, size: Size | None) -> Facts:
             poses.append(np.column_stack([rotation, numbers("cam_t_w2c", image.get("cam_t_w2c"), 3)]))
     if any(not np.allclose(values, values[0]) for values in (matrices, poses, scales) if values):
         raise CalibrationError(f"the camera moves or changes over its {len(images)} images, expected one that stands")
-    pose = Pose(poses[0][:, :3], poses[0][:, 3], BASE_TO_CAMERA, OPTICAL, None, 1e-3) if poses else None
-    return {"": CameraFacts(matrices[0], pose=pose, depth_unit=scales[0] * 1e-3)}
+    pose = Pose(poses[0][:, :3], poses[0][:, 3], BASE_TO_CAMERA, OPTICAL, None, MILLIMETRES) if poses else None
+    return {"": CameraFacts(matrices[0], pose=pose, depth_unit=scales[0] * MILLIMETRES)}
 
 
 def _is_motors(document: Document) -> bool:
@@ -99,6 +97,6 @@ def _motors(document: Document, size: Size | None) -> Facts:
     raise CalibrationError("it calibrates the robot's motors, not a camera; expected a file with a camera's K or pose")
 
 
-SIMULATED = Format("MuJoCo, robosuite or ManiSkill matrices", lambda document: bool(_cameras(document)), _simulated)
+SIMULATED = Format("MuJoCo, robosuite or ManiSkill matrices", _is_simulated, _simulated)
 BOP = Format("BOP scene_camera.json", _is_bop, _bop)
 LEROBOT_MOTORS = Format("LeRobot's motor calibration", _is_motors, _motors)

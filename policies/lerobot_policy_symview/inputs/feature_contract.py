@@ -12,6 +12,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
+from lerobot_symview.datasets.features import image_size
 from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
 from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Camera, stored_camera
@@ -146,9 +147,9 @@ def _fixed_camera(meta: Any, name: str) -> Camera | None:
 
 def _image_size(meta: Any, camera: str) -> tuple[int, int] | None:
     """Return the rows and columns of a camera's images, also where `symview-add-views` left them out."""
-    if keys.rgb(camera) in meta.features:
-        height, width, _ = meta.features[keys.rgb(camera)]["shape"]
-        return height, width
+    size = image_size(meta.features, keys.rgb(camera))
+    if size is not None:
+        return size
     recorded = _calibration_file(meta)
     in_file = recorded.cameras.get(camera) if recorded else None
     return (in_file.height, in_file.width) if in_file else None

@@ -9,7 +9,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from lerobot_symview.calibration.convert import convert
-from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
+from lerobot_symview.calibration.file import parse_calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.calibration.readings import PoseReading, ReadingError, readings
 from lerobot_symview.calibration.writers import camera_info, easy_handeye2
 from lerobot_symview.errors import CalibrationError, OptionError

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import yaml
 
-from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
+from lerobot_symview.calibration.file import parse_calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace

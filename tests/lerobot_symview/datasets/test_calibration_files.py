@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import read_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.calibration.readings import PoseReading, ReadingError
 from lerobot_symview.datasets import add_views
 from lerobot_symview.datasets.add_views import calibration_and_workspace

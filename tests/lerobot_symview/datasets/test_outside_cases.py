@@ -10,7 +10,8 @@ import yaml
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import parse_calibration, plain_calibration, read_calibration
+from lerobot_symview.calibration.file import parse_calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.image_codec import decode_depth
 from lerobot_symview.errors import CalibrationError, DatasetError

@@ -59,7 +59,7 @@ def test_costs_are_medians_of_the_nearest_results(tmp_path):
         write_result(
             tmp_path / cell.path, replace(result(cell.configuration_hash, seed=cell.seed), times=Times(cpu_s=seconds))
         )
-    costs = Costs.measured(finished_results(tmp_path, "laptop").values())
+    costs = Costs.measured(finished_results(tmp_path, "laptop"))
 
     def seconds(name, task, method):
         return costs.seconds(select(EXPERIMENTS[name], LAPTOP, [task], [method])[0])

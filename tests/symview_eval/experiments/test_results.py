@@ -52,16 +52,16 @@ def test_a_file_without_results_is_refused(text, tmp_path):
 
 def test_a_finished_cell_is_not_run_again(tmp_path):
     (cell,) = cells("table1")
-    assert unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name)) == [cell]
+    assert unfinished_cells([cell], finished_results(tmp_path, SCALE.name)) == [cell]
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
-    assert unfinished_cells([cell], tmp_path, finished_results(tmp_path, SCALE.name)) == []
+    assert unfinished_cells([cell], finished_results(tmp_path, SCALE.name)) == []
 
 
 def test_a_cell_with_other_settings_is_run_again(tmp_path):
     (cell,) = cells("table1")
     write_result(tmp_path / cell.path, result("another"))
     finished = finished_results(tmp_path, SCALE.name)
-    assert unfinished_cells([cell], tmp_path, finished) == [cell]
+    assert unfinished_cells([cell], finished) == [cell]
     copy_shared([cell], tmp_path, finished)
     assert read_result(tmp_path / cell.path).origin.configuration == "another"
 
@@ -70,6 +70,6 @@ def test_a_result_of_another_table_is_copied(tmp_path):
     (cell,), (equal_cell,) = cells("table1"), cells("table4")
     write_result(tmp_path / cell.path, result(cell.configuration_hash))
     finished = finished_results(tmp_path, SCALE.name)
-    assert unfinished_cells([equal_cell], tmp_path, finished) == []
+    assert unfinished_cells([equal_cell], finished) == []
     copy_shared([equal_cell], tmp_path, finished)
     assert read_result(tmp_path / equal_cell.path).checkpoints == result().checkpoints

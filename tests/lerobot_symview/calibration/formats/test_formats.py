@@ -7,9 +7,10 @@ import pytest
 import yaml
 
 from lerobot_symview.calibration.convert import convert
-from lerobot_symview.calibration.file import parse_calibration, read_calibration
+from lerobot_symview.calibration.file import parse_calibration
 from lerobot_symview.calibration.formats import FORMATS, parse, recognise
 from lerobot_symview.calibration.formats.document import read_document
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
 from tests.lerobot_symview.calibration.formats import files
 

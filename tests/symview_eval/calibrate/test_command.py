@@ -13,14 +13,15 @@ from lerobot.cameras import Camera as Device
 from lerobot.cameras import CameraConfig
 from PIL import Image
 
-import tests.lerobot_symview.calibration as this_package
+import tests.symview_eval.calibrate as this_package
 from lerobot_symview import keys
-from lerobot_symview.calibration import command
 from lerobot_symview.calibration.board import Board
-from lerobot_symview.calibration.file import Calibration, plain_calibration, read_calibration
+from lerobot_symview.calibration.file import Calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
+from symview_eval.calibrate import command
 from tests.helpers.boards import K, camera_over, close_views, photograph, pose_errors
 from tests.helpers.cameras import plane_depth
 from tests.lerobot_symview.calibration.formats import files

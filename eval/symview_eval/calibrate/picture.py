@@ -8,11 +8,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_symview.geometry.camera import Array, Camera, project
 from lerobot_symview.geometry.workspace import Workspace
+from symview_eval.contact_sheet import draw_line, with_outline
 
-TABLE, CEILING, CORNER = (255, 60, 0), (255, 190, 0), (255, 0, 255)  # RGB
+CORNER = (255, 0, 255)  # RGB
 AXES = {"x": (230, 0, 0), "y": (0, 160, 0), "z": (0, 90, 255)}  # RGB
 LONGEST = 1280  # pixels: smaller images are enlarged to about this
-SAMPLES = 32  # points per line, so that lines bend as in a wide lens and end where they pass behind the camera
 
 
 def calibration_picture(
@@ -37,26 +37,14 @@ def calibration_picture(
         corners: (N, 2) pixels to mark.
         caption: text in the lower left corner.
     """
-    scale = max(1, round(LONGEST / max(rgb.shape[:2])))
-    image = Image.fromarray(rgb.repeat(scale, axis=0).repeat(scale, axis=1))
+    drawn = with_outline(rgb, camera, workspace, LONGEST)
+    scale, image = len(drawn) // len(rgb), Image.fromarray(drawn)
     draw, width = ImageDraw.Draw(image), max(2, max(image.size) // 400)
     font = ImageFont.load_default(8 * width)
-
-    def line(start: Array, end: Array, color: tuple[int, int, int]) -> None:
-        pixels, depth = project(start + np.linspace(0, 1, SAMPLES)[:, None] * (end - start), camera)
-        points = [tuple(point) for point in ((pixels + 0.5) * scale).tolist()]
-        for first, second, near, far in zip(points, points[1:], depth, depth[1:], strict=False):
-            if near > 0 and far > 0:
-                draw.line([first, second], fill=color, width=width)
-
-    for height, color in ((workspace.height_limit, CEILING), (0.0, TABLE)):
-        border = workspace.corners(height)
-        for start, end in zip(border, np.roll(border, -1, axis=0), strict=True):
-            line(start, end, color)
     frame = np.eye(4) if world_from_board is None else world_from_board
     origin = np.array([*workspace.center, 0.0]) if world_from_board is None else frame[:3, 3]
     for direction, (name, color) in zip(frame[:3, :3].T, AXES.items(), strict=True):
-        line(origin, origin + axis * direction, color)
+        draw_line(draw, camera, scale, origin, origin + axis * direction, color, width)
         tip, depth = project(origin + 1.15 * axis * direction, camera)
         if depth > 0:
             draw.text(tuple((tip + 0.5) * scale), name, fill=color, font=font, anchor="mm")

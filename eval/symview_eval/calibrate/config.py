@@ -1,0 +1,105 @@
+"""Flags of `symview-calibrate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_symview.calibration.board import Board
+from lerobot_symview.calibration.readings import PoseReading
+from lerobot_symview.calibration.writers import WRITERS
+from lerobot_symview.geometry.units import parse_unit
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.registry import lookup
+from lerobot_symview.runtime.cli import DatasetLocation
+
+
+@dataclass(frozen=True)
+class PrintedBoard(Board):
+    """A board, and the file to print it from."""
+
+    print: Path | None = None
+    """Write the board as a .pdf or .png of its true size, and end."""
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """Find a camera's pose, and its intrinsics if they are not known, from images of a printed board on the table.
+
+    Writes the calibration, and beside it a picture with the workspace and the board's axes drawn into the image.
+    """
+
+    board: PrintedBoard = field(default_factory=PrintedBoard)
+    """The board, its place on the table, and where to print it to."""
+    images: str | None = None
+    """Images of the board: a file, a folder, or a pattern such as 'photos/*.jpg'."""
+    dataset: DatasetLocation | None = None
+    """Dataset whose frames of `camera` show the board."""
+    episodes: list[int] = field(default_factory=lambda: [0])
+    """Episodes of the dataset."""
+    frames: int = 1
+    """Images per episode of the dataset, evenly spaced, or images to take with the device, two seconds apart."""
+    camera: str = "front"
+    """Name of the camera in the calibration, as in observation.images.front."""
+    pose_image: str = ""
+    """Image that shows the board at its place on the table; by default the first. In all others it may be anywhere."""
+    intrinsics: str = ""
+    """`fx,fy,cx,cy` in pixels, or a calibration file with the camera. By default they are estimated from all images."""
+    workspace: Workspace | None = None
+    """Square on the table that views show; by default that of an existing output, else 0.4 m about the board."""
+    refine: str = ""
+    """`table`: tilt and lift the camera so that the table in a depth image lies at z = 0."""
+    calibration: Path | None = None
+    """Calibration file whose camera is refined, in place of one from images of a board."""
+    depth: Path | None = None
+    """Depth image of the table for `refine`, a 16-bit PNG, a TIFF or a .npy; by default the dataset's first frame."""
+    depth_unit: str | None = None
+    """Unit of depth: m, mm, or metres per unit; by default the dataset's, or the one that shows the table at z = 0."""
+    convert: list[Path] = field(default_factory=list)
+    """Calibration files of other tools, which complete each other, to write in place of a calibration from images."""
+    pose: PoseReading = field(default_factory=PoseReading)
+    """How to read the pose in `convert`; by default as its file says, else as the reading that sees the workspace."""
+    image_size: tuple[int, int] | None = None
+    """Rows and columns of the camera's images, for files in `convert` that do not say them."""
+    to: str = ""
+    """Format of the output of `convert`, `camera_info` or `easy_handeye2`; by default our own."""
+    output: Path = Path("cameras.yaml")
+    """Calibration file to write; other cameras in it are kept."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise ValueError(f"--frames must be at least 1, got {self.frames}")
+        if self.to:
+            lookup("--to", self.to, WRITERS)
+        if self.to and not self.convert:
+            raise ValueError("--to is the format that --convert writes: give both")
+        if self.refine not in ("", "table"):
+            raise ValueError(f"--refine must be table, got {self.refine!r}")
+        if self.calibration is not None and not self.refine:
+            raise ValueError("--calibration is what --refine=table corrects: give both")
+        if self.refine and self.depth is None and self.dataset is None:
+            raise ValueError("--refine=table needs a depth image: --depth, or --dataset with depth")
+        if self.depth_unit is not None:
+            try:
+                parse_unit(self.depth_unit)
+            except ValueError as error:
+                raise ValueError(f"--depth_unit: {error}") from None
+
+
+def with_device() -> type[CalibrateConfig]:
+    """Return the configuration with a LeRobot camera; LeRobot, which takes seconds to import, registers its types."""
+    from lerobot.cameras import CameraConfig
+    from lerobot.cameras.opencv import configuration_opencv  # noqa: F401
+    from lerobot.cameras.realsense import configuration_realsense  # noqa: F401
+    from lerobot.cameras.zmq import configuration_zmq  # noqa: F401
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+
+    @dataclass(frozen=True)
+    class CalibrateWithDeviceConfig(CalibrateConfig):
+        device: CameraConfig | None = None
+
+    CalibrateWithDeviceConfig.__annotations__["device"] = CameraConfig | None
+    CalibrateWithDeviceConfig.__doc__ = CalibrateConfig.__doc__
+    return CalibrateWithDeviceConfig

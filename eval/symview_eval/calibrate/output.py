@@ -1,0 +1,102 @@
+"""Writes calibrations, and pictures by which they are checked."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
+from lerobot_symview.geometry.camera import Array, Camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.runtime.cli import flagged
+from symview_eval.calibrate.config import CalibrateConfig
+from symview_eval.calibrate.picture import calibration_picture
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """A calibrated camera, with the image, the lens and the corners that its picture shows."""
+
+    camera: Camera
+    rgb: NDArray[np.uint8] | None = None
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
+    corners: Array | None = None
+    caption: str = ""
+    depth_unit: float | None = None
+
+
+def existing_calibration(file: Path) -> Calibration:
+    """Return the calibration in the output, to which the camera is added."""
+    if not file.exists():
+        return Calibration({})
+    with flagged("--output"):
+        return read_calibration(file)
+
+
+def write_result(config: CalibrateConfig, known: Calibration, workspace: Workspace, result: Result) -> Path:
+    """Write the calibration and its picture; the calibration last, and at once."""
+    camera = result.camera
+    entry: dict[str, Any] = {
+        "height": camera.height,
+        "width": camera.width,
+        "intrinsics": np.round([camera.fx, camera.fy, camera.cx, camera.cy], 4).tolist(),
+        "world_from_cam": camera.world_from_cam.round(7).tolist(),
+    }
+    depth_unit = result.depth_unit or known.depth_units.get(config.camera)
+    if depth_unit is not None:
+        entry["depth_unit"] = depth_unit
+    content = {
+        "units": "m",
+        "workspace": asdict(workspace) | {"center": list(workspace.center)},
+        "cameras": plain_calibration(known)["cameras"] | {config.camera: entry},
+    }
+    parse_calibration(content)
+    if result.distortion.any():
+        entry["distortion"] = result.distortion.round(8).tolist()
+    config.output.parent.mkdir(parents=True, exist_ok=True)
+    files = [config.output]
+    if result.rgb is not None:
+        files.append(config.output.with_name(f"{config.output.stem}_{config.camera}.png"))
+        _picture(config, workspace, result).save(files[-1])
+    replace_file(config.output, _yaml(content))
+    x, y, z = camera.position
+    logger.info(
+        "camera %r is at x %.3f, y %.3f, z %.3f m; wrote %s", config.camera, x, y, z, " and ".join(map(str, files))
+    )
+    return config.output
+
+
+def replace_file(file: Path, text: str) -> None:
+    """Write a file at once."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    part = file.with_name(file.name + ".partial")
+    part.write_text(text)
+    part.replace(file)
+
+
+def _picture(config: CalibrateConfig, workspace: Workspace, result: Result) -> Any:
+    """Return the picture of a result, without its lens distortion: the drawn lines are straight."""
+    rgb, corners, matrix = result.rgb, result.corners, result.camera.intrinsics
+    assert rgb is not None
+    if result.distortion.any():
+        rgb = cv2.undistort(rgb, matrix, result.distortion)
+        if corners is not None:
+            corners = cv2.undistortPoints(corners[:, None], matrix, result.distortion, P=matrix)[:, 0]
+    board = None if config.calibration else config.board.world_from_board
+    return calibration_picture(rgb, result.camera, workspace, board, 2 * config.board.square, corners, result.caption)
+
+
+def _yaml(content: dict[str, Any]) -> str:
+    import yaml
+
+    header = "# Written by symview-calibrate. Metres, OpenCV axes (x right, y down, z forward).\n"
+    return header + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
