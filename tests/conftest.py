@@ -14,6 +14,9 @@ os.environ["NUMBA_BOUNDSCHECK"] = "1"
 if "PYTEST_XDIST_WORKER" not in os.environ:  # xdist workers share the folders of the first process
     scratch = tempfile.mkdtemp(prefix="symview-tests-")
     os.environ |= {"HF_HOME": f"{scratch}/huggingface", "NUMBA_CACHE_DIR": f"{scratch}/numba"}
+    # Without bytecode, which an environment may forbid, every process compiles PyTorch and LeRobot.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = f"{scratch}/bytecode"
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
 
 import pytest
