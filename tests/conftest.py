@@ -1,9 +1,11 @@
 """Shared fixtures: a small recorded dataset and copies of it with views, created once per session by the library."""
 
 import atexit
+import multiprocessing
 import os
 import shutil
 import tempfile
+from multiprocessing import forkserver
 from pathlib import Path
 
 # Hugging Face's libraries and numba read these variables at import, which happens below.
@@ -34,11 +36,27 @@ settings.load_profile("repeatable")
 
 VIEW_SIZE = 76
 EPISODES = 2
+WORKER_MODULES = [
+    "lerobot.envs.utils",
+    "lerobot_symview.datasets.derivation",
+    "symview_eval.experiments.cells",
+    "symview_sim.env",
+    "symview_sim.recording",
+    "symview_sim.simulators",
+]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run the slowest files first, so that xdist workers finish at about the same time."""
     items.sort(key=lambda item: [item.get_closest_marker(name) is None for name in ("slow", "long")])
+
+
+@pytest.fixture(scope="session", autouse=True)
+def fork_server() -> None:
+    """Import once what worker processes of all tests use: a fork server preloads what its first user names, no more."""
+    if "PYTEST_XDIST_WORKER" in os.environ:  # most tests have no worker processes, but every run of all tests has
+        multiprocessing.get_context("forkserver").set_forkserver_preload(WORKER_MODULES)
+        forkserver.ensure_running()
 
 
 @pytest.fixture
