@@ -20,6 +20,8 @@ from lerobot_symview.geometry.lens import Lens, stored_lens
 
 Array = NDArray[np.float64]
 
+Optics = tuple[Lens | None, float, float, float, float, int, int]
+
 BORDER_SAMPLES = 33  # per side of the image, where a lens is checked
 
 
@@ -51,7 +53,8 @@ class Camera:
         lens = None if self.lens is None or self.lens.is_pinhole else self.lens
         problems = calibration_problems(intrinsics, world_from_cam, self.height, self.width)
         if lens is not None and not problems:
-            problems = _lens_problems(lens, *_four(intrinsics), self.height, self.width)
+            (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+            problems = _lens_problems(lens, fx, fy, cx, cy, self.height, self.width)
         if problems:
             raise CalibrationError("invalid camera: " + "; ".join(problems))
         object.__setattr__(self, "intrinsics", intrinsics)
@@ -87,6 +90,11 @@ class Camera:
     def cam_from_world(self) -> Array:
         """(4, 4) inverse of `world_from_cam`."""
         return invert_rigid(self.world_from_cam)
+
+    @property
+    def optics(self) -> Optics:
+        """What the ideal pixels of its image depend on: lens, fx, fy, cx, cy, height and width."""
+        return self.lens, self.fx, self.fy, self.cx, self.cy, self.height, self.width
 
     def enlarged(self, factor: int) -> Camera:
         """Return the camera with the same field of view and `factor` times the rows and columns."""
@@ -167,12 +175,6 @@ def _lens_problems(lens: Lens, fx: float, fy: float, cx: float, cy: float, heigh
     ]
 
 
-def _four(intrinsics: Array) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy."""
-    (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
-    return fx, fy, cx, cy
-
-
 def intrinsics_from_fov(fov: float, height: int, width: int) -> Array:
     """Return K (3, 3) of a centred pinhole camera with a vertical field of view of `fov` radians.
 
@@ -237,7 +239,7 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
     """
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-    u, v = ideal_pixels(camera)
+    u, v = ideal_pixels(camera.optics)
     x_over_z, y_over_z = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     z = depth.astype(np.float64)
     points_cam = np.stack([z * x_over_z, z * y_over_z, z], axis=-1)
@@ -262,26 +264,27 @@ def project(points_world: Array, camera: Camera) -> tuple[Array, Array]:
         return from_ideal(homogeneous[..., :2] / depth[..., None], camera), depth
 
 
-def ideal_pixels(camera: Camera) -> tuple[Array, Array]:
+def ideal_pixels(optics: Optics) -> tuple[Array, Array]:
     """Return the ideal pixels of all pixels of an image: u and v, float64, that broadcast to (H, W).
 
     Without a lens they are the pixels themselves, (W,) and (H, 1). With a lens they are read-only (H, W) maps, exact to
-    1e-6 pixels, which are cached for recent intrinsics and lenses: the camera may move.
+    1e-6 pixels, which are cached for recent optics: the camera may move.
+
+    Args:
+        optics: of the camera, `Camera.optics`.
     """
-    if camera.lens is None:
-        return np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64)[:, None]
-    u, v = _ideal_map(camera.lens, *_four(camera.intrinsics), camera.height, camera.width)
-    return u, v
+    lens, *_, height, width = optics
+    if lens is None:
+        return np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[:, None]
+    return _ideal_maps(*optics)
 
 
 @lru_cache(maxsize=8)  # 5 MB each for images of 640 x 480
-def _ideal_map(lens: Lens, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> Array:
-    """Return the ideal pixels (2, H, W)."""
+def _ideal_maps(lens: Lens, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> tuple[Array, Array]:
     y, x = np.meshgrid((np.arange(height) - cy) / fy, (np.arange(width) - cx) / fx, indexing="ij")
-    ideal = lens.undistort(np.stack([x, y], axis=-1)) * [fx, fy] + [cx, cy]
-    planes = np.ascontiguousarray(np.moveaxis(ideal, -1, 0))
-    planes.flags.writeable = False
-    return planes
+    u, v = np.moveaxis(lens.undistort(np.stack([x, y], axis=-1)) * [fx, fy] + [cx, cy], -1, 0).copy()
+    u.flags.writeable = v.flags.writeable = False
+    return u, v
 
 
 def to_ideal(pixels: Array, camera: Camera) -> Array:

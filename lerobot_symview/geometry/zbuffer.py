@@ -82,7 +82,7 @@ def zbuffer_from_depth(
         if camera.lens is None:
             _draw_depth(depth, *grid, ceiling, first, *buffer)
         else:
-            _draw_depth_through_lens(depth, *ideal_pixels(camera), *grid, ceiling, first, *buffer)
+            _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, ceiling, first, *buffer)
         first += depth.size
     return buffer
 
