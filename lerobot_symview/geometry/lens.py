@@ -57,8 +57,7 @@ class Lens:
             raise CalibrationError(f"the lens model {self.model} has {counts} coefficients, got {len(values)}")
         if not np.isfinite(values).all():
             raise CalibrationError(f"distortion coefficients must be finite, got {values}")
-        padding = max(COEFFICIENTS[self.model]) - len(values)
-        object.__setattr__(self, "coefficients", values + padding * (0.0,))
+        object.__setattr__(self, "coefficients", values)
 
     @property
     def is_pinhole(self) -> bool:
