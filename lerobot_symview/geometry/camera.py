@@ -96,11 +96,13 @@ class Camera:
         """What the ideal pixels of its image depend on: lens, fx, fy, cx, cy, height and width."""
         return self.lens, self.fx, self.fy, self.cx, self.cy, self.height, self.width
 
-    def enlarged(self, factor: int) -> Camera:
-        """Return the camera with the same field of view and `factor` times the rows and columns."""
-        intrinsics = self.intrinsics * [[factor], [factor], [1]]
-        intrinsics[:2, 2] += (factor - 1) / 2  # integer coordinates are pixel centres
-        return Camera(intrinsics, self.world_from_cam, factor * self.height, factor * self.width, self.lens)
+    def resized(self, height: int, width: int) -> Camera:
+        """Return the camera of the image after a change of its size; the field of view is the same."""
+        scale = np.array([width / self.width, height / self.height])
+        intrinsics = self.intrinsics.copy()
+        intrinsics[:2] *= scale[:, None]
+        intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
+        return Camera(intrinsics, self.world_from_cam, height, width, self.lens)
 
 
 def stored_camera(
