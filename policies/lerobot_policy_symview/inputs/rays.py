@@ -33,7 +33,7 @@ def pixel_rays(
     v, u = ((axis + 0.5) * full / count - 0.5 for axis, full, count in zip((v, u), calibrated, size, strict=True))
     x = (u - k[:, 0, 2, None, None]) / k[:, 0, 0, None, None]
     y = (v - k[:, 1, 2, None, None]) / k[:, 1, 1, None, None]
-    x, y = torch.broadcast_tensors(x, y)
+    x, y = x.expand(-1, *size), y.expand(-1, *size)
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
 
 
