@@ -37,6 +37,16 @@ def world_from_cam(camera: str) -> str:
     return f"{CALIBRATIONS}{camera}.world_from_cam"
 
 
+def distortion(camera: str) -> str:
+    """float32 (9,) model and coefficients of the lens, as `Lens.stored` returns; absent for pinhole cameras."""
+    return f"{CALIBRATIONS}{camera}.distortion"
+
+
+def calibration(camera: str) -> list[str]:
+    """Features that the calibration of `camera` may have: intrinsics, pose, and distortion if it has a lens."""
+    return [intrinsics(camera), world_from_cam(camera), distortion(camera)]
+
+
 def view(camera: str, output: str) -> str:
     """Output of a view rendered from `camera`; `output` is, for example, `reproj` or `reproj_height`."""
     return f"{IMAGES}{camera}_{output}"

@@ -238,7 +238,9 @@ def _observation(
         frame = Frame(
             rgb,
             features[depth][..., 0] if depth in features else None,
-            stored_camera(features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], *rgb.shape[:2]),
+            stored_camera(
+                features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
+            ),
             workspace,
             features[keys.STATE],
         )

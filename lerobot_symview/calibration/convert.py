@@ -191,6 +191,9 @@ def _equal(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     if set(first) != set(second):
         return False
     try:
-        return all(np.allclose(first[key], second[key]) for key in first if key != "distortion_model")
+        return all(
+            first[key] == second[key] if key == "distortion_model" else np.allclose(first[key], second[key])
+            for key in first
+        )
     except (TypeError, ValueError):
         return first == second

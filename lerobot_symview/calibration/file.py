@@ -1,7 +1,7 @@
 """Camera calibration from a file, for datasets and robots that do not store it.
 
-Matrices are rounded to float32, the precision of datasets, so that views rendered with the file's matrices and with a
-dataset's stored matrices are bit-identical. In place of `world_from_cam` the file may have its inverse,
+Matrices and lenses are rounded to float32, the precision of datasets, so that views rendered with the numbers of the
+file and of a dataset are bit-identical. In place of `world_from_cam` the file may have its inverse,
 `cam_from_world`, or `position` and `quaternion_xyzw` of the camera in the world.
 
 The file is YAML or JSON:
@@ -19,13 +19,15 @@ The file is YAML or JSON:
           - [0,  0.70711, -0.70711, 1.02]
           - [1,  0,        0,       0   ]
           - [0, -0.70711, -0.70711, 0.57]
+        distortion: [0.09, -0.18, 0.0005, -0.0003, 0.06]      # k1, k2, p1, p2, k3, as OpenCV orders them; optional
+        distortion_model: plumb_bob # or rational_polynomial, equidistant (fisheye); by default by the count, 4, 5 or 8
         depth_unit: mm              # m, mm, or metres per unit such as 0.0001; optional
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
@@ -33,6 +35,7 @@ import numpy as np
 
 from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
+from lerobot_symview.geometry.lens import Lens, lens_from_coefficients
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
 
@@ -43,10 +46,6 @@ REQUIRED = ("height", "width", "intrinsics")
 POSES = ("world_from_cam", "cam_from_world", "position")
 OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion", "distortion_model")
 ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
-UNDISTORT = (
-    "lens distortion is not supported: undistort the images when recording, "
-    "cv2.undistort(image, K, distortion, None, new_K), and give new_K as intrinsics"
-)
 
 
 @dataclass(frozen=True)
@@ -130,6 +129,7 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
             "width": camera.width,
             "intrinsics": camera.intrinsics.tolist(),
             "world_from_cam": camera.world_from_cam.tolist(),
+            **plain_lens(camera.lens),
             **({"depth_unit": calibration.depth_units[name]} if name in calibration.depth_units else {}),
         }
         for name, camera in calibration.cameras.items()
@@ -138,6 +138,11 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
     if calibration.workspace is not None:
         content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}
     return content
+
+
+def plain_lens(lens: Lens | None) -> dict[str, Any]:
+    """Return the entries of a lens in a camera's mapping; none for a pinhole camera."""
+    return {} if lens is None else {"distortion": list(lens.coefficients), "distortion_model": lens.model}
 
 
 def _camera(name: str, entries: Any, metres: float) -> Camera:
@@ -152,15 +157,14 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
         problems.append(f"expected one of {', '.join(POSES)}, got {', '.join(poses) or 'none'}")
     if ("position" in entries) != ("quaternion_xyzw" in entries):
         problems.append("position and quaternion_xyzw belong together")
-    if np.any(entries.get("distortion") or 0):
-        problems.append(UNDISTORT)
     if problems:
         raise CalibrationError("; ".join(problems))
     for side in ("height", "width"):
         if not isinstance(entries[side], int) or entries[side] < 1:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
-    return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"])
+    lens = _lens(entries.get("distortion"), entries.get("distortion_model"))
+    return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"], lens)
 
 
 def _intrinsics(value: Any) -> Array:
@@ -172,6 +176,16 @@ def _intrinsics(value: Any) -> Array:
         return numbers.reshape(3, 3)
     fx, fy, cx, cy = numbers
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _lens(coefficients: Any, model: Any) -> Lens | None:
+    """Return the lens; None if no coefficient, or none other than 0, is given."""
+    if coefficients is None:
+        return None
+    if not isinstance(model, str | None):
+        raise CalibrationError(f"distortion_model must be a name, got {model!r}")
+    numbers = _numbers("distortion", coefficients, range(15), "OpenCV's 4, 5 or 8 coefficients")
+    return lens_from_coefficients(model, _as_float32(numbers))
 
 
 def _pose(name: str, entries: Mapping[str, Any], metres: float) -> Array:
@@ -215,12 +229,12 @@ def _nearest_rotation(name: str, matrix: Array) -> Array:
     return nearest
 
 
-def _numbers(name: str, value: Any, counts: tuple[int, ...], expected: str) -> Array:
+def _numbers(name: str, value: Any, counts: Container[int], expected: str) -> Array:
     try:
         numbers = np.array(value, dtype=np.float64).ravel()
     except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if len(numbers) not in counts:
+        numbers = None
+    if numbers is None or len(numbers) not in counts:
         raise CalibrationError(f"{name} must be {expected}, got {value!r}")
     return numbers
 

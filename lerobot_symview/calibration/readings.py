@@ -104,9 +104,8 @@ def resolve(
         logger.info("camera %r: its position, %s, is read as millimetres", name, pose.translation)
     if len(possible) == 1:
         return next(iter(possible.values()))
-    pinhole = {key: value for key, value in entries.items() if not key.startswith("distortion")}
     cameras = {
-        description: parse_calibration({"units": "m", "cameras": {name: pinhole | entry}}).camera(name)
+        description: parse_calibration({"units": "m", "cameras": {name: {**entries, **entry}}}).camera(name)
         for description, entry in possible.items()
     }
     if workspace is None:

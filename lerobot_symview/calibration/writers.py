@@ -10,8 +10,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from lerobot_symview.calibration.file import parse_calibration
-from lerobot_symview.calibration.formats.facts import PLUMB_BOB, lens
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
 
 
 def camera_info(content: Mapping[str, Any], name: str) -> str:
@@ -24,10 +23,8 @@ def camera_info(content: Mapping[str, Any], name: str) -> str:
     Raises:
         CalibrationError: if the content is invalid or has no such camera.
     """
-    camera = _camera(content, name)
-    entries = content["cameras"][name]
-    distortion = lens(entries.get("distortion_model"), entries.get("distortion") or [])
-    coefficients = list(distortion.get("distortion", [0.0] * 5))
+    camera = parse_calibration(content).camera(name)
+    lens = camera.lens or Lens(PLUMB_BOB, (0.0,) * 5)
     projection = np.column_stack([camera.intrinsics, np.zeros(3)])
     return yaml.safe_dump(
         {
@@ -35,8 +32,8 @@ def camera_info(content: Mapping[str, Any], name: str) -> str:
             "image_height": camera.height,
             "camera_name": name,
             "camera_matrix": _matrix(camera.intrinsics),
-            "distortion_model": distortion.get("distortion_model", PLUMB_BOB),
-            "distortion_coefficients": _matrix(np.array([coefficients])),
+            "distortion_model": lens.model,
+            "distortion_coefficients": _matrix(np.array([lens.coefficients])),
             "rectification_matrix": _matrix(np.eye(3)),
             "projection_matrix": _matrix(projection),
         },
@@ -56,7 +53,7 @@ def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link"
     Raises:
         CalibrationError: if the content is invalid or has no such camera.
     """
-    pose = _camera(content, name).world_from_cam
+    pose = parse_calibration(content).camera(name).world_from_cam
     x, y, z, w = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
     return yaml.safe_dump(
         {
@@ -74,15 +71,6 @@ def easy_handeye2(content: Mapping[str, Any], name: str, base: str = "base_link"
         sort_keys=False,
         default_flow_style=None,
     )
-
-
-def _camera(content: Mapping[str, Any], name: str) -> Camera:
-    """Return the camera without its lens."""
-    cameras = {
-        each: {key: value for key, value in entries.items() if not key.startswith("distortion")}
-        for each, entries in content["cameras"].items()
-    }
-    return parse_calibration({**content, "cameras": cameras}).camera(name)
 
 
 def _matrix(matrix: np.ndarray) -> dict[str, Any]:

@@ -191,8 +191,9 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
     added: Features = {}
     if calibration is not None:
         with flagged(f"--calibration={_listed(config.calibration)}"):
-            check_camera(config.camera, calibration.camera(config.camera), workspace)
-        added |= calibration_features(config.camera)
+            camera = calibration.camera(config.camera)
+            check_camera(config.camera, camera, workspace)
+        added |= calibration_features(config.camera, lens=camera.lens is not None)
     for name, view in views.items():
         added |= view_features(config.camera, name, view, workspace)
     kept = config.kept_images()

@@ -19,6 +19,11 @@ SHOWN_TASKS = 5  # instructions that are listed
 HEIGHT = 228  # rows of the card's image
 TAGS = ("LeRobot", "symview", "robotics", "equivariance")
 REPOSITORY = "lerobot_symview"
+LENS = (
+    "\n`distortion` is the camera's lens (9 numbers): its model, 0 none, 1 `plumb_bob`, 2 `rational_polynomial`, 3 "
+    "`equidistant` (OpenCV's fisheye), then the model's coefficients in OpenCV's order and zeros. The images are "
+    "distorted.\n"
+)
 
 
 def write_card(folder: Path, repo_id: str, tags: list[str]) -> None:
@@ -129,7 +134,7 @@ def _calibration(dataset: SourceDataset) -> str:
         "`world_from_cam` (16 numbers, row-major), which maps camera coordinates (x right, y down, z forward, "
         "metres) to world coordinates (z up, table at z = 0). Integer pixel coordinates are pixel centres; depth is in "
         "metres along the optical axis, 0 where it is invalid. In top-down views, rows grow with the world's x and "
-        "columns with y.\n"
+        "columns with y.\n" + (LENS if any(key.endswith(".distortion") for key in known) else "")
     )
 
 

@@ -202,12 +202,14 @@ def image_column(images: list[bytes], extension: str) -> pa.StructArray:
 
 
 def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
-    """Return the calibration matrices that are added to the result, flattened float32, by feature key."""
+    """Return the calibration that is added to the result, flattened float32, by feature key."""
     if derivation.calibration is None:
         return {}
     camera = derivation.calibration.camera(derivation.camera)
-    matrices = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
-    return {key(derivation.camera): matrix.astype(np.float32).ravel() for key, matrix in matrices.items()}
+    numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
+    if camera.lens is not None:
+        numbers[keys.distortion] = camera.lens.stored()
+    return {key(derivation.camera): values.astype(np.float32).ravel() for key, values in numbers.items()}
 
 
 def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:

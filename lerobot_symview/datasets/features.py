@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import UNIT_NAMES
 from lerobot_symview.geometry.workspace import Workspace
 
@@ -47,9 +48,9 @@ def camera_features(
     return features | calibration_features(name)
 
 
-def calibration_features(name: str) -> Features:
-    """Declare the calibration of one camera."""
-    return {
+def calibration_features(name: str, *, lens: bool = False) -> Features:
+    """Declare the calibration of one camera, and optionally its lens."""
+    features: Features = {
         keys.intrinsics(name): {
             "dtype": "float32",
             "shape": (9,),
@@ -61,6 +62,11 @@ def calibration_features(name: str) -> Features:
             "names": [f"t{i}{j}" for i in range(4) for j in range(4)],
         },
     }
+    if lens:
+        # The model is a number of the column, and every model has as many, so that datasets with any lenses merge.
+        names = ["model", *(f"d{index}" for index in range(1, STORED))]
+        features[keys.distortion(name)] = {"dtype": "float32", "shape": (STORED,), "names": names}
+    return features
 
 
 def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:

@@ -322,8 +322,13 @@ class FrameReader:
         required += [keys.depth(self.camera)] if self.depth else []
         required += [keys.STATE] if self.gripper else []
         if self.calibration is None:
-            required += [keys.intrinsics(self.camera), keys.world_from_cam(self.camera)]
+            required += self._calibration()
         return required
+
+    def _calibration(self) -> list[str]:
+        """Return the keys of the stored calibration: intrinsics, pose, and distortion if the dataset has it."""
+        *needed, distortion = keys.calibration(self.camera)
+        return [*needed, distortion] if distortion in self.dataset.features else needed
 
     def columns(self) -> list[str]:
         """Return the table columns that `frames` reads: its features except videos."""
@@ -358,21 +363,21 @@ class FrameReader:
         states: Iterator[Any] = repeat(None)
         if self.gripper:
             states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
-        matrices: Iterator[Any] = repeat(None)
+        calibrations: Iterator[Any] = repeat(None)
         if self.calibration is None:
-            stored = (vectors(table, key(self.camera)) for key in (keys.intrinsics, keys.world_from_cam))
-            matrices = zip(*stored, strict=True)
-        steps = zip(colors, depths, states, matrices, strict=False)
-        for index, (rgb, depth, state, stored_matrices) in enumerate(islice(steps, len(table))):
+            calibrations = zip(*(vectors(table, key) for key in self._calibration()), strict=True)
+        steps = zip(colors, depths, states, calibrations, strict=False)
+        for index, (rgb, depth, state, stored) in enumerate(islice(steps, len(table))):
             try:
-                camera = self._camera(stored_matrices, *rgb.shape[:2])
+                camera = self._camera(stored, *rgb.shape[:2])
             except CalibrationError as error:
                 raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
             yield Frame(rgb, depth, camera, self.workspace, state)
 
-    def _camera(self, matrices: tuple[NDArray, NDArray] | None, height: int, width: int) -> Camera:
-        if matrices is not None:
-            return stored_camera(*matrices, height, width)
+    def _camera(self, stored: tuple[NDArray, ...] | None, height: int, width: int) -> Camera:
+        if stored is not None:
+            intrinsics, world_from_cam, *distortion = stored
+            return stored_camera(intrinsics, world_from_cam, height, width, *distortion)
         assert self.calibration is not None
         camera = self.calibration.camera(self.camera)
         if (camera.height, camera.width) != (height, width):

@@ -1,10 +1,14 @@
-"""Pinhole cameras: intrinsics, poses, projection and its inverse.
+"""Cameras: intrinsics, lenses, poses, projection and its inverse.
+
+A lens maps pixels to *ideal* pixels, at which a pinhole camera with the same K would show the same rays; behind them
+all geometry is that of the pinhole camera.
 
 Axes are OpenCV's (x right, y down, z forward), integer pixel coordinates are pixel centres, lengths are metres.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,37 +16,50 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.lens import Lens, stored_lens
 
 Array = NDArray[np.float64]
+
+Optics = tuple[Lens | None, float, float, float, float, int, int]
+
+BORDER_SAMPLES = 33  # per side of the image, where a lens is checked
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated pinhole camera.
+    """A calibrated camera.
 
     Args:
         intrinsics: (3, 3) float64, the matrix K in pixels, no skew.
         world_from_cam: (4, 4) float64, rigid, maps camera coordinates to world coordinates, metres.
         height: image rows.
         width: image columns.
+        lens: its distortion; None, or a lens that distorts nothing, for a pinhole camera.
 
     Raises:
-        CalibrationError: if the matrices are invalid; one message lists all problems.
+        CalibrationError: if the matrices are invalid, or the lens does not show one ray in each pixel; one message
+            lists all problems.
     """
 
     intrinsics: Array
     world_from_cam: Array
     height: int
     width: int
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
         world_from_cam = np.asarray(self.world_from_cam, dtype=np.float64)
+        lens = None if self.lens is None or self.lens.is_pinhole else self.lens
         problems = calibration_problems(intrinsics, world_from_cam, self.height, self.width)
+        if lens is not None and not problems:
+            (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
+            problems = _lens_problems(lens, fx, fy, cx, cy, self.height, self.width)
         if problems:
             raise CalibrationError("invalid camera: " + "; ".join(problems))
         object.__setattr__(self, "intrinsics", intrinsics)
         object.__setattr__(self, "world_from_cam", world_from_cam)
+        object.__setattr__(self, "lens", lens)
 
     @property
     def fx(self) -> float:
@@ -74,14 +91,23 @@ class Camera:
         """(4, 4) inverse of `world_from_cam`."""
         return invert_rigid(self.world_from_cam)
 
-    def enlarged(self, factor: int) -> Camera:
-        """Return the camera with the same field of view and `factor` times the rows and columns."""
-        intrinsics = self.intrinsics * [[factor], [factor], [1]]
-        intrinsics[:2, 2] += (factor - 1) / 2  # integer coordinates are pixel centres
-        return Camera(intrinsics, self.world_from_cam, factor * self.height, factor * self.width)
+    @property
+    def optics(self) -> Optics:
+        """What the ideal pixels of its image depend on: lens, fx, fy, cx, cy, height and width."""
+        return self.lens, self.fx, self.fy, self.cx, self.cy, self.height, self.width
+
+    def resized(self, height: int, width: int) -> Camera:
+        """Return the camera of the image after a change of its size; the field of view is the same."""
+        scale = np.array([width / self.width, height / self.height])
+        intrinsics = self.intrinsics.copy()
+        intrinsics[:2] *= scale[:, None]
+        intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
+        return Camera(intrinsics, self.world_from_cam, height, width, self.lens)
 
 
-def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, width: int) -> Camera:
+def stored_camera(
+    intrinsics: NDArray, world_from_cam: NDArray, height: int, width: int, distortion: NDArray | None = None
+) -> Camera:
     """Return the camera with the matrices stored in a dataset or an observation.
 
     Args:
@@ -89,24 +115,26 @@ def stored_camera(intrinsics: NDArray, world_from_cam: NDArray, height: int, wid
         world_from_cam: (16,) or (4, 4), metres.
         height: image rows.
         width: image columns.
+        distortion: (9,), as `Lens.stored` returns; None for a pinhole camera.
 
     Returns:
         The same object for equal arguments, so that results that depend on the camera alone can be cached.
 
     Raises:
-        CalibrationError: if the matrices are invalid, as for `Camera`.
+        CalibrationError: if the matrices or the lens are invalid, as for `Camera`.
     """
     matrices = (np.asarray(matrix, dtype=np.float64).tobytes() for matrix in (intrinsics, world_from_cam))
-    return _camera(*matrices, height, width)
+    return _camera(*matrices, height, width, None if distortion is None else stored_lens(distortion))
 
 
 @lru_cache(maxsize=256)
-def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int) -> Camera:
-    return Camera(np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(world_from_cam).reshape(4, 4), height, width)
+def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int, lens: Lens | None) -> Camera:
+    k, pose = np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(world_from_cam).reshape(4, 4)
+    return Camera(k, pose, height, width, lens)
 
 
 def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:
-    """Return all problems of the matrices of a pinhole camera; empty if they are valid."""
+    """Return all problems of the matrices of a camera; empty if they are valid."""
     if intrinsics.shape != (3, 3):
         return [f"intrinsics must have shape (3, 3), got {intrinsics.shape}"]
     if world_from_cam.shape != (4, 4):
@@ -130,6 +158,23 @@ def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, 
     if not np.allclose(world_from_cam[3], [0, 0, 0, 1], atol=1e-6):
         problems.append(f"last row of world_from_cam must be 0 0 0 1, got {world_from_cam[3]}")
     return problems
+
+
+@lru_cache(maxsize=256)
+def _lens_problems(lens: Lens, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> list[str]:
+    """Return what is wrong with a lens that does not show one ray in each pixel of an image."""
+    u, v = (np.linspace(-0.5, side - 0.5, BORDER_SAMPLES) for side in (width, height))
+    low, high = np.full_like(u, -0.5), np.full_like(u, -0.5)
+    border = np.concatenate(
+        [np.column_stack(side) for side in ((u, low), (u, high + height), (low, v), (high + width, v))]
+    )
+    if not np.isnan(lens.undistort((border - [cx, cy]) / [fx, fy])).any():
+        return []
+    return [
+        f"the {lens.model} lens shows rays only up to {lens.reach * min(fx, fy):.0f} pixels from the principal point, "
+        f"beyond which it folds back, and the {width} x {height} image is larger: check the model, the order of its "
+        "coefficients and the image size that they belong to, or crop the image"
+    ]
 
 
 def intrinsics_from_fov(fov: float, height: int, width: int) -> Array:
@@ -196,15 +241,15 @@ def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:
     """
     if depth.shape != (camera.height, camera.width):
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-    x_over_z = (np.arange(camera.width) - camera.cx) / camera.fx
-    y_over_z = (np.arange(camera.height) - camera.cy) / camera.fy
+    u, v = ideal_pixels(camera.optics)
+    x_over_z, y_over_z = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     z = depth.astype(np.float64)
-    points_cam = np.stack([z * x_over_z, z * y_over_z[:, None], z], axis=-1)
+    points_cam = np.stack([z * x_over_z, z * y_over_z, z], axis=-1)
     return transform(camera.world_from_cam, points_cam)
 
 
 def project(points_world: Array, camera: Camera) -> tuple[Array, Array]:
-    """Project world points to pixels: y = K (R x + t), divided by its last entry (paper section 4.2).
+    """Project world points to pixels: y = K (R x + t), divided by its last entry (paper section 4.2), and the lens.
 
     Args:
         points_world: (..., 3), metres.
@@ -218,4 +263,42 @@ def project(points_world: Array, camera: Camera) -> tuple[Array, Array]:
     depth = points_cam[..., 2]
     homogeneous = points_cam @ camera.intrinsics.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        return homogeneous[..., :2] / depth[..., None], depth
+        return from_ideal(homogeneous[..., :2] / depth[..., None], camera), depth
+
+
+def ideal_pixels(optics: Optics) -> tuple[Array, Array]:
+    """Return the ideal pixels of all pixels of an image: u and v, float64, that broadcast to (H, W).
+
+    Without a lens they are the pixels themselves, (W,) and (H, 1). With a lens they are read-only (H, W) maps, exact to
+    1e-6 pixels, which are cached for recent optics: the camera may move.
+
+    Args:
+        optics: of the camera, `Camera.optics`.
+    """
+    lens, *_, height, width = optics
+    if lens is None:
+        return np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[:, None]
+    return _ideal_maps(*optics)
+
+
+@lru_cache(maxsize=8)  # 5 MB each for images of 640 x 480
+def _ideal_maps(lens: Lens, fx: float, fy: float, cx: float, cy: float, height: int, width: int) -> tuple[Array, Array]:
+    y, x = np.meshgrid((np.arange(height) - cy) / fy, (np.arange(width) - cx) / fx, indexing="ij")
+    u, v = np.moveaxis(lens.undistort(np.stack([x, y], axis=-1)) * [fx, fy] + [cx, cy], -1, 0).copy()
+    u.flags.writeable = v.flags.writeable = False
+    return u, v
+
+
+def to_ideal(pixels: Array, camera: Camera) -> Array:
+    """Map pixels (..., 2) of a camera's image to ideal pixels (..., 2); NaN where its lens shows no ray."""
+    return pixels if camera.lens is None else _through(camera.lens.undistort, pixels, camera)
+
+
+def from_ideal(pixels: Array, camera: Camera) -> Array:
+    """Map ideal pixels (..., 2) to pixels (..., 2) of a camera's image; inverse of `to_ideal`."""
+    return pixels if camera.lens is None else _through(camera.lens.distort, pixels, camera)
+
+
+def _through(mapping: Callable[[Array], Array], pixels: Array, camera: Camera) -> Array:
+    center, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+    return mapping((pixels - center) / focal) * focal + center

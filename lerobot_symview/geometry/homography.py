@@ -1,4 +1,7 @@
-"""Homography of a plane parallel to the table, and its warp to a top-down image (paper section 4.2)."""
+"""Homography of a plane parallel to the table, and its warp to a top-down image (paper section 4.2).
+
+With a lens, the homography maps to the camera's ideal pixels and the warp continues to its pixels.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, Camera
+from lerobot_symview.geometry.camera import Array, Camera, from_ideal
 from lerobot_symview.geometry.workspace import Workspace
 
 FARTHEST = 30_000.0  # pixels; within int16
@@ -24,7 +27,7 @@ class WarpMap(NamedTuple):
 
 
 def image_from_topdown(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> Array:
-    """Return the homography (3, 3) from top-down pixels (column, row, 1) to camera pixels (u, v, 1), up to scale.
+    """Return the homography (3, 3) from top-down pixels (column, row, 1) to ideal pixels (u, v, 1), up to scale.
 
     The plane lies `plane_height` metres above the table. y = K(Rx + t) restricted to that plane is itself a
     homography, so no linear system is solved: the workspace corners map to the image corners by construction.
@@ -66,7 +69,8 @@ def warp_map(camera: Camera, workspace: Workspace, pixels: int, plane_height: fl
     columns, rows = np.meshgrid(np.arange(pixels), np.arange(pixels))
     u, v, w = homography @ np.stack([columns.ravel(), rows.ravel(), np.ones(pixels**2)])
     # Pixels outside the image are black at any distance; clip to the range of int16.
-    image_xy = np.clip(np.stack([u, v], axis=-1) / w[:, None], -FARTHEST, FARTHEST).astype(np.float32)
+    image_xy = from_ideal(np.stack([u, v], axis=-1) / w[:, None], camera)
+    image_xy = np.clip(image_xy, -FARTHEST, FARTHEST).astype(np.float32)
     whole, fraction = cv2.convertMaps(image_xy.reshape(pixels, pixels, 2), None, cv2.CV_16SC2)
     return WarpMap(whole, fraction)
 

@@ -17,7 +17,8 @@ MAX_STEP = 0.04
 def enlarge_depth(depth: NDArray[np.floating], factor: int) -> NDArray[np.float32]:
     """Upsample a depth image; interpolate within surfaces, not across depth edges.
 
-    The inverse of depth is affine over a plane's image, so its bilinear interpolation is exact for planes. Across an
+    The inverse of depth is affine over a plane's image, so its bilinear interpolation is exact for planes, and through
+    a lens as good as exact, since neighbouring pixels share its distortion. Across an
     edge, where neighbours differ by more than 4 %, and beside invalid pixels, the nearest pixel's depth is repeated.
 
     Args:
@@ -25,7 +26,7 @@ def enlarge_depth(depth: NDArray[np.floating], factor: int) -> NDArray[np.float3
         factor: upsampling factor of rows and columns, at least 1.
 
     Returns:
-        (factor * H, factor * W) float32, metres, 0 where invalid; for the camera `Camera.enlarged(factor)`.
+        (factor * H, factor * W) float32, metres, 0 where invalid; for the camera `Camera.resized` to this size.
     """
     rows, columns = depth.shape
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, Camera, invert_rigid, project
+from lerobot_symview.geometry.camera import Array, Camera, ideal_pixels, invert_rigid, project
 from lerobot_symview.geometry.workspace import Workspace
 
 MINIMUM_VISIBLE = 0.6  # fraction of the working volume
@@ -98,7 +98,7 @@ def table_rays(camera: Camera, workspace: Workspace, step: int = 1) -> tuple[Arr
         (h, w, 3) world directions of depth 1; (h, w) depth at which they meet the table, metres; (h, w) whether they
         meet the square.
     """
-    v, u = np.mgrid[: camera.height : step, : camera.width : step]
+    u, v = (plane[::step, ::step] for plane in np.broadcast_arrays(*ideal_pixels(camera.optics)))
     in_camera = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
     directions = in_camera @ camera.world_from_cam[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lerobot_symview.geometry.camera import Array, Camera
+from lerobot_symview.geometry.camera import Array, Camera, ideal_pixels
 from lerobot_symview.geometry.workspace import Workspace
 
 EMPTY = -1  # source of a cell without points
@@ -78,7 +78,11 @@ def zbuffer_from_depth(
     for depth, camera in zip(depths, cameras, strict=True):
         if depth.shape != (camera.height, camera.width):
             raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-        _draw_depth(depth, *grid_from_pixel(camera, workspace, pixels), ceiling, first, *buffer)
+        grid = grid_from_pixel(camera, workspace, pixels)
+        if camera.lens is None:
+            _draw_depth(depth, *grid, ceiling, first, *buffer)
+        else:
+            _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, ceiling, first, *buffer)
         first += depth.size
     return buffer
 
@@ -108,7 +112,7 @@ def _empty_buffer(pixels: int) -> ZBuffer:
 
 @lru_cache(maxsize=256)
 def grid_from_pixel(camera: Camera, workspace: Workspace, pixels: int) -> tuple[Array, Array]:
-    """Return A (3, 3) and b (3,): pixel (u, v) at depth d maps to (row, column, height) = d A (u, v, 1) + b.
+    """Return A (3, 3) and b (3,): ideal pixel (u, v) at depth d maps to (row, column, height) = d A (u, v, 1) + b.
 
     A and b are float64 and combine paper Eq. 2-6. Integer (u, v) are pixel centres; depth is in metres along the
     optical axis; rows and columns are in cells, measured from the grid's edge; height is in metres above the table.
@@ -162,6 +166,28 @@ def _draw_depth(depth, rays, origin, ceiling, first, height, source):  # type: i
                     if cell >= 0 and (source[cell] < 0 or rounded > height[cell]):
                         height[cell] = rounded
                         source[cell] = first + v * columns + u
+
+
+@njit(cache=True, nogil=True)
+def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, first, height, source):  # type: ignore[no-untyped-def]
+    """Draw as `_draw_depth` does, with the same rounding, but look up the ideal pixels."""
+    side = height.shape[0]
+    height, source = height.ravel(), source.ravel()
+    rows, columns = depth.shape
+    for i in range(rows):
+        for j in range(columns):
+            distance = np.float64(depth[i, j])
+            if distance > 0.0 and distance < np.inf:
+                u, v = us[i, j], vs[i, j]
+                z = origin[2] + distance * (rays[2, 0] * u + (rays[2, 1] * v + rays[2, 2]))
+                if z <= ceiling:
+                    row = origin[0] + distance * (rays[0, 0] * u + (rays[0, 1] * v + rays[0, 2]))
+                    column = origin[1] + distance * (rays[1, 0] * u + (rays[1, 1] * v + rays[1, 2]))
+                    cell = _cell(row, column, side)
+                    rounded = np.float32(z)
+                    if cell >= 0 and (source[cell] < 0 or rounded > height[cell]):
+                        height[cell] = rounded
+                        source[cell] = first + i * columns + j
 
 
 @njit(cache=True, nogil=True)

@@ -169,7 +169,7 @@ class ReprojectedView(View):
 
 @lru_cache(maxsize=64)
 def _enlarged(camera: Camera, factor: int) -> Camera:
-    return camera.enlarged(factor)
+    return camera.resized(factor * camera.height, factor * camera.width)
 
 
 @lru_cache(maxsize=8)

@@ -1,18 +1,20 @@
 """Batched views as torch tensors, on any device, bit-identical to rendering the frames one by one.
 
 Every step is a separate operation in float64 or integers, so that no device fuses two steps and rounds differently.
-This backend is for GPUs: on a CPU the compiled kernels of `lerobot_symview.geometry` are faster.
+This backend is for GPUs: on a CPU the compiled kernels of `lerobot_symview.geometry` are faster. Maps of lenses are
+computed on the CPU, once, and kept on the device.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.camera import Camera, Optics, ideal_pixels
 from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.homography import warp_map
 from lerobot_symview.geometry.visibility import check_above_table
@@ -133,8 +135,7 @@ def zbuffer_batch(
         torch.from_numpy(np.array(values)).to(depth.device)
         for values in ([ray for ray, _ in matrices], [start for _, start in matrices], ceilings)
     )
-    v = torch.arange(rows, dtype=torch.float64, device=depth.device)[:, None]
-    u = torch.arange(columns, dtype=torch.float64, device=depth.device)
+    u, v = _ideal_pixels(cameras, depth.device)
     distance = depth.double()
     rays, origin = rays[..., None, None], origin[..., None, None]  # (B, 3, 3, 1, 1) and (B, 3, 1, 1)
     row, column, z = (
@@ -154,6 +155,22 @@ def zbuffer_batch(
     source = torch.where(best > 0, 2**SOURCE_BITS - 1 - (best & (2**SOURCE_BITS - 1)), EMPTY)
     height = heights.flatten(1).gather(1, source.clamp(min=0).flatten(1)).view_as(source)
     return torch.where(source == EMPTY, torch.zeros_like(height), height), source
+
+
+def _ideal_pixels(cameras: list[Camera], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the ideal pixels of the cameras, u and v, that broadcast to (B, H, W)."""
+    if len({camera.optics for camera in cameras}) == 1 or all(camera.lens is None for camera in cameras):
+        return _ideal_pixels_on(device, cameras[0].optics)
+    size = (cameras[0].height, cameras[0].width)
+    maps = [[plane.expand(size) for plane in _ideal_pixels_on(device, camera.optics)] for camera in cameras]
+    u, v = (torch.stack(planes) for planes in zip(*maps, strict=True))
+    return u, v
+
+
+@lru_cache(maxsize=8)
+def _ideal_pixels_on(device: torch.device, optics: Optics) -> tuple[Tensor, Tensor]:
+    u, v = (torch.from_numpy(np.array(plane)).to(device) for plane in ideal_pixels(optics))
+    return u, v
 
 
 def _ordered(values: Tensor) -> Tensor:

@@ -317,8 +317,8 @@ class SymviewConfig(PreTrainedConfig):
         if len(others) != 1:
             return dict(features)
         views = [keys.view(camera, output) for output in self.make_view().outputs] if self.is_computed else []
-        calibration = [keys.intrinsics(camera), keys.world_from_cam(camera)]
-        return keys.as_camera(features, camera, others[0], [keys.rgb(camera), keys.depth(camera), *calibration, *views])
+        own = [keys.rgb(camera), keys.depth(camera), *keys.calibration(camera), *views]
+        return keys.as_camera(features, camera, others[0], own)
 
     @property
     def camera_calibration(self) -> dict[str, Any]:

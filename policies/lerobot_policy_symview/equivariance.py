@@ -23,6 +23,7 @@ from lerobot_policy_symview.symmetry.groups import PlanarGroup, make_group
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
+from lerobot_symview.geometry.lens import EQUIDISTANT, NUMBERS
 from lerobot_symview.geometry.placement import CameraSpec
 
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10, torch.bfloat16: 5e-2}
@@ -140,12 +141,18 @@ def transform_observation(
 
 
 def _reflected_image(observation: ObservationBatch, config: SymviewConfig) -> ObservationBatch:
-    """Return a camera's images with reversed columns, and the intrinsics that belong to them."""
-    images = {key: observation[key].flip(-1) for key in config.raw_keys}
+    """Return a camera's images with reversed columns, and the intrinsics and lens that belong to them."""
+    reflected = {key: observation[key].flip(-1) for key in config.raw_keys}
     key = keys.intrinsics(config.camera)
     k = observation[key].clone()
-    k[:, 2] = images[config.raw_keys[0]].shape[-1] - 1 - k[:, 2]
-    return images | {key: k}
+    k[:, 2] = reflected[config.raw_keys[0]].shape[-1] - 1 - k[:, 2]
+    reflected[key] = k
+    key = keys.distortion(config.camera)
+    if key in observation:
+        lens = observation[key].clone()
+        lens[:, 4] *= torch.where(lens[:, 0] == NUMBERS[EQUIDISTANT], 1, -1)  # p2, which an equidistant lens lacks
+        reflected[key] = lens
+    return reflected
 
 
 def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> ObservationBatch:

@@ -46,7 +46,8 @@ def export_policy(policy: SymviewPolicy, observation: dict[str, Tensor]) -> torc
         The program of a `PolicyModule`; `example_inputs` has the features that it reads.
     """
     # two samples, since torch.export takes a size of 1 for a constant
-    example = {key: torch.cat([observation[key][:1]] * 2) for key in policy.scene.keys if key in observation}
+    read = [*policy.scene.keys, *policy.scene.optional_keys]
+    example = {key: torch.cat([observation[key][:1]] * 2) for key in read if key in observation}
     batch = torch.export.Dim("batch")
     return torch.export.export(PolicyModule(policy), (example,), dynamic_shapes=[{key: {0: batch} for key in example}])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.datasets.features import check_depth_size, declared_unit
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import (
     METRES,
     MILLIMETRES,
@@ -45,7 +47,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
     """Brings depth to float metres and adds top-down views of one camera; views that are present are kept unchanged.
 
     Colour is float in [0, 1] or uint8. Calibration is flat, (9,) and (16,), or square, (3, 3) and (4, 4), for all
-    frames or for each; an observation without it, such as a real robot's, uses `calibration`.
+    frames or for each, and may have a lens, (9,). An observation without it, such as a real robot's, uses
+    `calibration`.
 
     Args:
         views: the views to add, by name or as mappings with name and options (`lerobot_symview.views.ViewSpec`).
@@ -132,14 +135,14 @@ class ViewsProcessorStep(ObservationProcessorStep):
         if any(view.needs_depth for view in self._views.values()):
             source.append(keys.depth(self.camera))
         if self._fixed_camera is None:
-            source += self._matrix_keys
+            source += self._matrix_shapes
         others = keys.substitutes(observation, self.camera, made, source) if made else []
         if len(others) != 1:
             return observation
         if others[0] not in self._substitutes:
             self._substitutes.add(others[0])
             logger.info("the camera %r takes the place of %r", others[0], self.camera)
-        features = [keys.rgb(self.camera), keys.depth(self.camera), *self._matrix_keys, *made]
+        features = [keys.rgb(self.camera), keys.depth(self.camera), *keys.calibration(self.camera), *made]
         return keys.as_camera(observation, self.camera, others[0], features)
 
     def _in_metres(self, observation: RobotObservation) -> RobotObservation:
@@ -232,18 +235,21 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
     def _missing_matrices(self, observation: RobotObservation) -> list[str]:
         """Return the calibration's keys that the observation lacks, where the step has no calibration of its own."""
-        return [] if self._fixed_camera is not None else [key for key in self._matrix_keys if key not in observation]
+        return [] if self._fixed_camera is not None else [key for key in self._matrix_shapes if key not in observation]
 
     @property
-    def _matrix_keys(self) -> dict[str, int]:
-        """Keys of an observation's calibration -> rows of the matrix."""
-        return {keys.intrinsics(self.camera): 3, keys.world_from_cam(self.camera): 4}
+    def _matrix_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Keys of an observation's calibration -> shape of the matrix."""
+        return {keys.intrinsics(self.camera): (3, 3), keys.world_from_cam(self.camera): (4, 4)}
 
     def _cameras(self, observation: RobotObservation, count: int, height: int, width: int) -> list[Camera]:
         """Return the camera of each of `count` frames: the observation's, else the step's own."""
-        if all(key in observation for key in self._matrix_keys):
-            stored = (_matrices(key, observation[key], side, count) for key, side in self._matrix_keys.items())
-            return [stored_camera(k, pose, height, width) for k, pose in zip(*stored, strict=True)]
+        if all(key in observation for key in self._matrix_shapes):
+            shapes = dict(self._matrix_shapes)
+            if keys.distortion(self.camera) in observation:
+                shapes[keys.distortion(self.camera)] = (STORED,)
+            stored = (_numbers(key, observation[key], shape, count) for key, shape in shapes.items())
+            return [stored_camera(k, pose, height, width, *lens) for k, pose, *lens in zip(*stored, strict=True)]
         camera = self._fixed_camera
         assert camera is not None
         if (height, width) != (camera.height, camera.width):
@@ -282,12 +288,13 @@ def _metres(depth: Tensor, unit: float) -> Tensor:
     return depth if unit == METRES else depth / depth.new_full((), units_per_metre(unit))
 
 
-def _matrices(key: str, matrix: Tensor, side: int, count: int) -> NDArray[np.floating]:
-    """Return (count, side^2): a matrix for each frame, or one for all, which LeRobot leaves without a batch axis."""
-    shapes = [(side**2,), (side, side), (count, side**2), (count, side, side)]
-    if tuple(matrix.shape) not in shapes:
-        raise CalibrationError(f"{key} has shape {tuple(matrix.shape)}, expected one of {shapes}")
-    return np.broadcast_to(matrix.detach().cpu().numpy().reshape(-1, side**2), (count, side**2))
+def _numbers(key: str, numbers: Tensor, shape: tuple[int, ...], count: int) -> NDArray[np.floating]:
+    """Return (count, N): numbers for each frame, or for all, which LeRobot leaves without a batch axis."""
+    flat = (math.prod(shape),)
+    shapes = list(dict.fromkeys([flat, shape, (count, *flat), (count, *shape)]))
+    if tuple(numbers.shape) not in shapes:
+        raise CalibrationError(f"{key} has shape {tuple(numbers.shape)}, expected one of {shapes}")
+    return np.broadcast_to(numbers.detach().cpu().numpy().reshape(-1, *flat), (count, *flat))
 
 
 def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:

@@ -7,7 +7,7 @@ import statistics
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,12 @@ from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import image_from_topdown
+from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
+from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.geometry.visibility import table_rays
+from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, ViewSpec, make_view
 from symview_eval.benchmarks.clock import Clock, seconds
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
@@ -31,6 +36,7 @@ from symview_sim.settings import EnvSettings, NewDataset
 
 BATCH = 64  # frames on a GPU
 NOISE = 2.0  # standard deviation in levels of 255: a webcam indoors
+WEBCAM = Lens(PLUMB_BOB, (-0.27, 0.05, 0.001, 0.0, 0.0))  # ordinary barrel distortion
 RECORDED = 25  # recorded episodes, repeated to fill the offline dataset
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
@@ -76,16 +82,17 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
 
     Returns:
         Medians, with the quartiles as `_low` and `_high`. `*_ratio`: a view's time over that of `cv2.warpPerspective`.
-        `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `batched_*`, on a
-        GPU: time per frame of a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on
-        reading, decoding, encoding and writing, for images with a real camera's noise. `offline_two_process_speedup`:
-        speed-up by a second process including its start-up, most of which falls into the first round. `frames_per_s`:
-        frames for which one process makes both views.
+        `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `vga_ms` and
+        `vga_lens_ms`: a 640 x 480 frame, without and with a lens, reprojected; `vga_lens_ratio`: the second over the
+        first, at most 2. `batched_*`, on a GPU: time per frame of a batch, without quartiles. `offline_codec_share`:
+        part of `symview-add-views` spent on reading, decoding, encoding and writing, for images with a real camera's
+        noise. `offline_two_process_speedup`: speed-up by a second process including its start-up, most of which falls
+        into the first round. `frames_per_s`: frames for which one process makes both views.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        results = _ratios(simulated_frame(), config.repeats)
+        results = _ratios(simulated_frame(), config.repeats) | lens_times(config.repeats)
     finally:
         cv2.setNumThreads(threads)
     results |= _on_a_gpu(config.repeats)
@@ -180,6 +187,30 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
             ratios.append(seconds(candidate) / reference)
         results |= _median_and_quartiles(f"{name}_ratio", ratios)
     return {"warp_us": 1e6 * statistics.median(warps)} | results
+
+
+def lens_times(repeats: int) -> dict[str, float]:
+    """Return the milliseconds of a reprojection of the table at 640 x 480 without and with a lens, and their ratio."""
+    view, workspace = make_view("reproj", clip="none"), Workspace()
+    placed = CameraSpec(height=480, width=640).place(workspace)
+    frames = [_table_frame(replace(placed, lens=lens), workspace) for lens in (None, WEBCAM)]
+    for frame in frames:
+        view.render(frame)
+    pairs = [[1000 * seconds(partial(view.render, frame)) for frame in frames] for _ in range(repeats)]
+    plain, through_lens = zip(*pairs, strict=True)
+    ratios = [distorted / pinhole for pinhole, distorted in pairs]
+    return (
+        _median_and_quartiles("vga_ms", list(plain))
+        | _median_and_quartiles("vga_lens_ms", list(through_lens))
+        | _median_and_quartiles("vga_lens_ratio", ratios)
+    )
+
+
+def _table_frame(camera: Camera, workspace: Workspace) -> Frame:
+    """Return the frame of an empty table, with random colours."""
+    _, depth, _ = table_rays(camera, workspace)
+    rgb = np.random.default_rng(0).integers(0, 256, (*depth.shape, 3), dtype=np.uint8)
+    return Frame(rgb, depth.astype(np.float32), camera, workspace)
 
 
 def _median_and_quartiles(name: str, values: list[float]) -> dict[str, float]:

@@ -130,7 +130,7 @@ def _levelled(config: CalibrateConfig, result: Result, workspace: Workspace) -> 
         camera, plane = levelled(depth, result.camera, workspace)
     read = "" if unit is None else f" (depth in {unit_name(unit)})"
     logger.info("in the depth image%s %s, before the correction; now at z = 0", read, plane)
-    return Result(camera, result.rgb, result.distortion, result.corners, f"{plane}: corrected")
+    return Result(camera, result.rgb, result.corners, f"{plane}: corrected")
 
 
 def main() -> None:

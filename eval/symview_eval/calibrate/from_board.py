@@ -19,6 +19,7 @@ from lerobot_symview.calibration.board_pose import (
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.lens import EQUIDISTANT, lens_from_coefficients
 from lerobot_symview.runtime.cli import CommandError, flagged
 from symview_eval.calibrate.config import CalibrateConfig
 from symview_eval.calibrate.output import Result
@@ -73,7 +74,8 @@ def from_board(config: CalibrateConfig) -> Result:
         corners = _find(image, config.board, intrinsics)
     with flagged(f"{pose_image}, --board, --intrinsics"):
         pose = board_pose(corners, intrinsics, width)
-        camera = Camera(intrinsics.matrix, world_from_cam(pose, config.board.world_from_board), height, width)
+        lens = lens_from_coefficients(None, intrinsics.distortion)
+        camera = Camera(intrinsics.matrix, world_from_cam(pose, config.board.world_from_board), height, width, lens)
     caption = f"{len(corners)} corners, reprojection error {pose.error_px:.2f} px, {pose.error_mm:.2f} mm on the table"
     logger.info(
         "%s: %s; board's orientation ± %.2f°, distance ± %.1f mm",
@@ -82,7 +84,7 @@ def from_board(config: CalibrateConfig) -> Result:
         pose.uncertainty_deg,
         pose.uncertainty_mm,
     )
-    return Result(camera, image, intrinsics.distortion, corners.pixels, caption)
+    return Result(camera, image, corners.pixels, caption)
 
 
 def _find(image: NDArray[np.uint8], board: Board, intrinsics: Intrinsics) -> Corners:
@@ -118,7 +120,14 @@ def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intri
                 f"--intrinsics: camera {name!r} has images of {camera.width} x {camera.height} pixels, "
                 f"these have {width} x {height}"
             ) from None
-        return Intrinsics(camera.intrinsics)
+        if camera.lens is None:
+            return Intrinsics(camera.intrinsics)
+        if camera.lens.model == EQUIDISTANT:
+            raise CalibrationError(
+                f"--intrinsics: camera {name!r} has an {EQUIDISTANT} lens, with which no pose is found from a board: "
+                "undistort the images, or estimate the intrinsics from them"
+            ) from None
+        return Intrinsics(camera.intrinsics, np.array(camera.lens.coefficients))
     return Intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 

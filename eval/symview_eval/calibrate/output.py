@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
+from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration, plain_lens
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -24,11 +23,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A calibrated camera, with the image, the lens and the corners that its picture shows."""
+    """A calibrated camera, with the image and the corners that its picture shows."""
 
     camera: Camera
     rgb: NDArray[np.uint8] | None = None
-    distortion: Array = field(default_factory=lambda: np.zeros(0))
     corners: Array | None = None
     caption: str = ""
     depth_unit: float | None = None
@@ -50,7 +48,10 @@ def write_result(config: CalibrateConfig, known: Calibration, workspace: Workspa
         "width": camera.width,
         "intrinsics": np.round([camera.fx, camera.fy, camera.cx, camera.cy], 4).tolist(),
         "world_from_cam": camera.world_from_cam.round(7).tolist(),
+        **plain_lens(camera.lens),
     }
+    if camera.lens is not None:
+        entry["distortion"] = np.round(camera.lens.coefficients, 8).tolist()
     depth_unit = result.depth_unit or known.depth_units.get(config.camera)
     if depth_unit is not None:
         entry["depth_unit"] = depth_unit
@@ -60,8 +61,6 @@ def write_result(config: CalibrateConfig, known: Calibration, workspace: Workspa
         "cameras": plain_calibration(known)["cameras"] | {config.camera: entry},
     }
     parse_calibration(content)
-    if result.distortion.any():
-        entry["distortion"] = result.distortion.round(8).tolist()
     config.output.parent.mkdir(parents=True, exist_ok=True)
     files = [config.output]
     if result.rgb is not None:
@@ -84,15 +83,11 @@ def replace_file(file: Path, text: str) -> None:
 
 
 def _picture(config: CalibrateConfig, workspace: Workspace, result: Result) -> Any:
-    """Return the picture of a result, without its lens distortion: the drawn lines are straight."""
-    rgb, corners, matrix = result.rgb, result.corners, result.camera.intrinsics
-    assert rgb is not None
-    if result.distortion.any():
-        rgb = cv2.undistort(rgb, matrix, result.distortion)
-        if corners is not None:
-            corners = cv2.undistortPoints(corners[:, None], matrix, result.distortion, P=matrix)[:, 0]
+    assert result.rgb is not None
     board = None if config.calibration else config.board.world_from_board
-    return calibration_picture(rgb, result.camera, workspace, board, 2 * config.board.square, corners, result.caption)
+    return calibration_picture(
+        result.rgb, result.camera, workspace, board, 2 * config.board.square, result.corners, result.caption
+    )
 
 
 def _yaml(content: dict[str, Any]) -> str:

@@ -12,12 +12,10 @@ from numpy.typing import ArrayLike
 from lerobot_symview.calibration.formats.document import Document
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.lens import lens_from_coefficients
 
 CAMERA_TO_BASE, BASE_TO_CAMERA = "camera_to_base", "base_to_camera"
 OPTICAL, ROS_LINK, OPENGL = "optical", "ros_link", "opengl"
-PLUMB_BOB, RATIONAL, EQUIDISTANT = "plumb_bob", "rational_polynomial", "equidistant"
-COEFFICIENTS = {PLUMB_BOB: (4, 5), RATIONAL: (8,), EQUIDISTANT: (4,)}
-"""Model of a lens, by its ROS name -> possible numbers of coefficients, in OpenCV's order."""
 Size = tuple[int, int]
 
 
@@ -140,25 +138,8 @@ def lens(model: str | None, coefficients: ArrayLike) -> dict[str, Any]:
     Raises:
         CalibrationError: if the model is unknown or has another number of coefficients.
     """
-    values: Array = np.asarray(coefficients, dtype=np.float64).ravel()
-    if not np.isfinite(values).all():
-        raise CalibrationError(f"distortion coefficients must be finite, got {values}")
-    if not values.any():
-        return {}
-    while model is None and len(values) > 8 and not values[8:].any():
-        values = values[:8]
-    model = model or (RATIONAL if len(values) == 8 else PLUMB_BOB)
-    if model not in COEFFICIENTS:
-        raise CalibrationError(
-            f"the lens model {model!r} is not supported, expected {', '.join(COEFFICIENTS)}: undistort the images"
-        )
-    most = max(COEFFICIENTS[model])
-    if len(values) > most and not values[most:].any():
-        values = values[:most]
-    if len(values) not in COEFFICIENTS[model]:
-        counts = " or ".join(map(str, COEFFICIENTS[model]))
-        raise CalibrationError(f"the lens model {model} has {counts} coefficients, got {len(values)}")
-    return {"distortion": tuple(values.tolist()), "distortion_model": model}
+    found = lens_from_coefficients(model, coefficients)
+    return {} if found is None else {"distortion": found.coefficients, "distortion_model": found.model}
 
 
 def matrix_pose(

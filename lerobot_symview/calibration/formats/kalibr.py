@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 from lerobot_symview.calibration.formats.document import Document
 from lerobot_symview.calibration.formats.facts import (
-    EQUIDISTANT,
-    PLUMB_BOB,
     CameraFacts,
     Facts,
     Format,
@@ -18,6 +16,7 @@ from lerobot_symview.calibration.formats.facts import (
     pinhole,
 )
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.lens import EQUIDISTANT, PLUMB_BOB
 
 MODELS = {"radtan": PLUMB_BOB, "equidistant": EQUIDISTANT}
 

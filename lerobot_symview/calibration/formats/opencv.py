@@ -12,9 +12,7 @@ import numpy as np
 from lerobot_symview.calibration.formats.document import FILE_STORAGE, Document
 from lerobot_symview.calibration.formats.facts import (
     BASE_TO_CAMERA,
-    EQUIDISTANT,
     OPTICAL,
-    PLUMB_BOB,
     CameraFacts,
     Facts,
     Format,
@@ -30,6 +28,7 @@ from lerobot_symview.calibration.formats.facts import (
     pinhole,
 )
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.lens import EQUIDISTANT, PLUMB_BOB
 
 MATRIX = ("camera_matrix", "cameramatrix", "k", "mtx", "intrinsics", "intrinsic", "intrinsic_matrix", "m1", "m")
 COEFFICIENTS = (

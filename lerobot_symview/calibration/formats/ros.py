@@ -8,8 +8,6 @@ from typing import Any
 from lerobot_symview.calibration.formats.document import Document
 from lerobot_symview.calibration.formats.facts import (
     CAMERA_TO_BASE,
-    EQUIDISTANT,
-    PLUMB_BOB,
     CameraFacts,
     Facts,
     Format,
@@ -24,6 +22,7 @@ from lerobot_symview.calibration.formats.facts import (
 )
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.lens import EQUIDISTANT, PLUMB_BOB
 
 MODELS = {"radtan": PLUMB_BOB, "fisheye": EQUIDISTANT, "": None}
 

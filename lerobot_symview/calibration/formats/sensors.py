@@ -11,9 +11,6 @@ import numpy as np
 
 from lerobot_symview.calibration.formats.document import Document
 from lerobot_symview.calibration.formats.facts import (
-    EQUIDISTANT,
-    PLUMB_BOB,
-    RATIONAL,
     CameraFacts,
     Facts,
     Format,
@@ -27,6 +24,7 @@ from lerobot_symview.calibration.formats.facts import (
 )
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.lens import EQUIDISTANT, PLUMB_BOB, RATIONAL
 from lerobot_symview.geometry.units import MILLIMETRES
 
 REALSENSE_MODELS = {"brown conrady": PLUMB_BOB, "kannala brandt4": EQUIDISTANT}

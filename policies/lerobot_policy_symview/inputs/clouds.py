@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_policy_symview.inputs.rays import pixel_rays
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
 
 POINTS = 1024  # points per scene that the point-cloud encoder gets
@@ -63,7 +66,13 @@ def fixed_ranks(count: int) -> Tensor:
 
 
 def cloud_from_depth(
-    rgb: Tensor, depth: Tensor, intrinsics: Tensor, world_from_cam: Tensor, workspace: Workspace, ceiling: Tensor
+    rgb: Tensor,
+    depth: Tensor,
+    intrinsics: Tensor,
+    world_from_cam: Tensor,
+    workspace: Workspace,
+    ceiling: Tensor,
+    cameras: Sequence[Camera] | None = None,
 ) -> Cloud:
     """Unproject RGBD images (paper Eq. 2 to 4); points in the working volume and below the ceiling are valid.
 
@@ -74,14 +83,12 @@ def cloud_from_depth(
         world_from_cam: (B, 16) row-major camera poses, translation in metres.
         workspace: the working volume.
         ceiling: (B,) metres above the table; points above it are invalid, which removes the arm, as in reprojection.
+        cameras: where cameras have a lens, the camera of each sample, or of all.
     """
-    batch, _, height, width = depth.shape
-    distance = depth[:, 0].double()
-    k, pose = intrinsics.double().view(batch, 3, 3), world_from_cam.double().view(batch, 4, 4)
-    v = torch.arange(height, dtype=torch.float64, device=depth.device)[:, None].expand(height, width).flatten()
-    u = torch.arange(width, dtype=torch.float64, device=depth.device)[None].expand(height, width).flatten()
-    x_over_z, y_over_z = (u - k[:, 0, 2:]) / k[:, 0, :1], (v - k[:, 1, 2:]) / k[:, 1, 1:2]
-    rays = torch.stack([x_over_z, y_over_z, torch.ones_like(x_over_z)], dim=-1) @ pose[:, :3, :3].transpose(1, 2)
+    batch, _, *size = depth.shape
+    distance, pose = depth[:, 0].double(), world_from_cam.double().view(batch, 4, 4)
+    in_camera = pixel_rays(intrinsics, tuple(size), tuple(size), cameras)
+    rays = in_camera.flatten(1, 2) @ pose[:, :3, :3].transpose(1, 2)
     world = rays * distance.view(batch, -1, 1) + pose[:, None, :3, 3]
     x, y, z = world.unbind(-1)
     position = torch.stack([x - workspace.center[0], y - workspace.center[1], z], dim=-1)

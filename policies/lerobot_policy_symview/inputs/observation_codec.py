@@ -26,7 +26,8 @@ class ObservationCodec:
 
     def pack(self, batch: dict[str, Tensor]) -> list[StoredObservation]:
         """Return one entry for each of B observations: colour in steps of 1/255, heights with 11 bits, metres."""
-        packed = {name: self._pack(name, batch[name]).cpu().numpy() for name in self._scene.keys}
+        names = [*self._scene.keys, *(name for name in self._scene.optional_keys if name in batch)]
+        packed = {name: self._pack(name, batch[name]).cpu().numpy() for name in names}
         return [{name: array[i] for name, array in packed.items()} for i in range(len(next(iter(packed.values()))))]
 
     def unpack(self, stored: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:

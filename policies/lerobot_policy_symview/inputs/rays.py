@@ -1,12 +1,51 @@
-"""Rays of a camera's pixels as image channels: Plücker coordinates, a baseline that knows the camera without a view."""
+"""Rays of a camera's pixels, and their Plücker coordinates: a baseline that knows the camera without a view."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_symview.geometry.camera import Camera, ideal_pixels
 from lerobot_symview.geometry.workspace import Workspace
+
+
+def pixel_rays(
+    intrinsics: Tensor, calibrated: tuple[int, ...], size: tuple[int, ...], cameras: Sequence[Camera] | None = None
+) -> Tensor:
+    """Return the directions (B, h, w, 3) of the rays of an image's pixels in the camera's frame, float64, of depth 1.
+
+    Args:
+        intrinsics: (B, 9), K in pixels of the image at its calibrated size.
+        calibrated: rows and columns of the image that K belongs to.
+        size: rows h and columns w of the image after downscaling; a pixel has the ray of its centre.
+        cameras: where cameras have a lens, the camera of each sample, or of all; its pose is not used.
+    """
+    k = intrinsics.double().view(-1, 3, 3)
+    if cameras is None:
+        v, u = (torch.arange(count, dtype=torch.float64, device=k.device) for count in size)
+        u, v = u[None, None], v[None, :, None]
+    else:
+        u, v = _ideal_pixels(cameras, size, k.device)
+    v, u = ((axis + 0.5) * full / count - 0.5 for axis, full, count in zip((v, u), calibrated, size, strict=True))
+    x = (u - k[:, 0, 2, None, None]) / k[:, 0, 0, None, None]
+    y = (v - k[:, 1, 2, None, None]) / k[:, 1, 1, None, None]
+    x, y = x.expand(-1, *size), y.expand(-1, *size)
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
+
+
+def _ideal_pixels(cameras: Sequence[Camera], size: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the ideal pixels, u and v, (1, h, w) or (B, h, w), of resized images."""
+    resized = [camera.resized(*size).optics for camera in cameras]
+    distinct = {optics: ideal_pixels(optics) for optics in resized}
+    if len(distinct) == 1:
+        resized = resized[:1]
+    maps = [np.broadcast_arrays(*distinct[optics]) for optics in resized]
+    u, v = (torch.from_numpy(np.stack(planes)).to(device) for planes in zip(*maps, strict=True))
+    return u, v
 
 
 def plucker_rays(
@@ -15,6 +54,7 @@ def plucker_rays(
     calibrated: tuple[int, ...],
     size: tuple[int, ...],
     workspace: Workspace,
+    cameras: Sequence[Camera] | None = None,
 ) -> Tensor:
     """Return the Plücker coordinates (B, 6, h, w) of the rays of an image's pixels, float32.
 
@@ -27,15 +67,10 @@ def plucker_rays(
         calibrated: rows and columns of the image that K belongs to.
         size: rows h and columns w of the image after downscaling; a pixel has the ray of its centre.
         workspace: gives the origin of the moments.
+        cameras: as for `pixel_rays`.
     """
-    k, pose = intrinsics.double().view(-1, 3, 3), world_from_cam.double().view(-1, 4, 4)
-    v, u = (
-        (torch.arange(count, dtype=torch.float64, device=k.device) + 0.5) * full / count - 0.5
-        for count, full in zip(size, calibrated, strict=True)
-    )
-    x = ((u - k[:, :1, 2]) / k[:, :1, 0])[:, None].expand(-1, size[0], -1)
-    y = ((v - k[:, 1:2, 2]) / k[:, 1:2, 1])[:, :, None].expand(-1, -1, size[1])
-    in_camera = torch.stack([x, y, torch.ones_like(x)], dim=-1)
+    pose = world_from_cam.double().view(-1, 4, 4)
+    in_camera = pixel_rays(intrinsics, calibrated, size, cameras)
     direction = torch.nn.functional.normalize(in_camera, dim=-1) @ pose[:, None, :3, :3].transpose(-1, -2)
     center = pose.new_tensor([*workspace.center, 0.0])
     moment = torch.linalg.cross((pose[:, :3, 3] - center)[:, None, None].expand_as(direction), direction)

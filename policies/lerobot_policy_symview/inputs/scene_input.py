@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,8 +20,10 @@ from lerobot_policy_symview.inputs.state import camera_directions
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration
+from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
@@ -47,13 +50,18 @@ class SceneInput(ABC):
     def keys(self) -> list[str]:
         """Features of a preprocessed observation that it reads."""
 
+    @property
+    def optional_keys(self) -> list[str]:
+        """Features that it reads where an observation has them: the camera's lens."""
+        return []
+
     def own_names(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return observations with the names of the policy's camera, where those of another were not all renamed.
 
         Raises:
             KeyError: if the observations lack a feature of the camera.
         """
-        calibration = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
+        calibration = keys.calibration(self.config.camera)
         optional = [keys.STATE] + (calibration if self._fixed_camera is not None else [])
         needed = [key for key in self.keys if key not in optional]
         missing = [key for key in needed if key not in batch]
@@ -106,9 +114,9 @@ class SceneInput(ABC):
 
     def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """K (B, 9) and pose (B, 16) of the camera: the observation's, or the configuration's where it has none."""
-        names = [keys.intrinsics(self.config.camera), keys.world_from_cam(self.config.camera)]
-        if all(name in batch for name in names):
-            return batch[names[0]], batch[names[1]]
+        intrinsics, world_from_cam, _ = keys.calibration(self.config.camera)
+        if self._has_calibration(batch):
+            return batch[intrinsics], batch[world_from_cam]
         assert self._fixed_camera is not None  # `own_names` has checked it
         state, camera = batch[keys.STATE], self._fixed_camera
         k, pose = (
@@ -116,6 +124,33 @@ class SceneInput(ABC):
             for matrix in (camera.intrinsics, camera.world_from_cam)
         )
         return k, pose
+
+    def _has_calibration(self, batch: dict[str, Tensor]) -> bool:
+        *needed, _ = keys.calibration(self.config.camera)
+        return all(key in batch for key in needed)
+
+    def _lenses(self, batch: dict[str, Tensor], size: tuple[int, ...]) -> list[Camera] | None:
+        """Cameras of the samples, or the one of all, if they have a lens; `size` are rows and columns of their images.
+
+        Raises:
+            CalibrationError: if a camera is invalid.
+            ValueError: if the operations are recorded, which cannot depend on the observation's lens.
+        """
+        intrinsics, _, distortion = keys.calibration(self.config.camera)
+        if self._has_calibration(batch):
+            if distortion not in batch:
+                return None
+            if is_exporting():
+                raise ValueError(
+                    "a policy is exported for one lens: give the policy the camera's calibration, and export it with "
+                    f"an observation without {', '.join(keys.calibration(self.config.camera))}"
+                )
+            height, width = size
+            matrices, lenses = (batch[key].detach().reshape(-1, 9).cpu().numpy() for key in (intrinsics, distortion))
+            pose = np.eye(4)  # rays in the camera's frame do not depend on it
+            return [stored_camera(k, pose, height, width, lens) for k, lens in zip(matrices, lenses, strict=True)]
+        assert self._fixed_camera is not None
+        return None if self._fixed_camera.lens is None else [self._fixed_camera]
 
 
 class ImageInput(SceneInput):
@@ -140,6 +175,11 @@ class ImageInput(SceneInput):
         if config.view.name == "top" and config.modality == "rgbd":
             features.append(keys.world_from_cam("top"))
         return features
+
+    @property
+    def optional_keys(self) -> list[str]:
+        """The camera's lens, for the rays of its pixels."""
+        return [keys.distortion(self.config.camera)] if self.config.camera_rays else []
 
     def form(
         self,
@@ -184,7 +224,8 @@ class ImageInput(SceneInput):
         size, recorded = images.shape[-2:], batch[self._color_key].shape[-2:]
         # stored observations are downscaled already; their calibration is that of the dataset's images
         calibrated = self._dataset_size if recorded == size and self._dataset_size else recorded
-        return plucker_rays(*self._calibration(batch), calibrated, size, self.workspace)
+        cameras = self._lenses(batch, calibrated)
+        return plucker_rays(*self._calibration(batch), calibrated, size, self.workspace, cameras)
 
     def _gripper(self, state: Tensor, pixels: int) -> Tensor:
         """Draw the gripper (B, pixels, pixels)."""
@@ -204,6 +245,11 @@ class PointInput(SceneInput):
             keys.rgb(camera), keys.STATE, keys.depth(camera), keys.intrinsics(camera), keys.world_from_cam(camera)
         ]  # fmt: skip
 
+    @property
+    def optional_keys(self) -> list[str]:
+        """The camera's lens."""
+        return [keys.distortion(self.config.camera)]
+
     def form(
         self,
         batch: dict[str, Tensor],
@@ -222,6 +268,7 @@ class PointInput(SceneInput):
             *self._calibration(batch),
             self.workspace,
             (z - clipping.clip_margin).clamp(min=clipping.clip_floor),
+            self._lenses(batch, batch[keys.depth(camera)].shape[-2:]),
         )
         if transform is not None:
             cloud = cloud.transformed(transform)

@@ -10,7 +10,8 @@ from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.nn.encoders.point_cloud import farthest_points, neighborhoods
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_symview.geometry.camera import unproject
+from lerobot_symview.geometry.camera import Camera, unproject
+from lerobot_symview.geometry.lens import Lens
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.settings import EnvSettings
 from tests.helpers.cameras import make_camera
@@ -27,7 +28,7 @@ def scene():
     return observation
 
 
-def make_cloud(scene, ceiling=1.0):
+def make_cloud(scene, ceiling=1.0, cameras=None):
     return cloud_from_depth(
         torch.from_numpy(scene["pixels"]["side"]).permute(2, 0, 1)[None] / 255,
         torch.from_numpy(scene["images.side_depth"])[None],
@@ -35,6 +36,7 @@ def make_cloud(scene, ceiling=1.0):
         torch.from_numpy(scene["camera.side.world_from_cam"])[None],
         WORKSPACE,
         torch.tensor([ceiling]),
+        cameras,
     )
 
 
@@ -49,6 +51,17 @@ def test_points_match_unproject(scene):
     np.testing.assert_allclose(cloud.position[0].numpy()[valid], expected[valid], atol=1e-6)
     inside = (np.abs(expected[:, :2]) < 0.2).all(axis=1) & (expected[:, 2] < WORKSPACE.height_limit)
     assert (valid == inside).mean() > 0.9999
+
+
+def test_points_respect_the_lens(scene):
+    lens = Lens("equidistant", (0.05, -0.01, 0.003, -0.0004))
+    k, pose = (scene[f"camera.side.{name}"].astype(np.float64) for name in ("intrinsics", "world_from_cam"))
+    camera = Camera(k.reshape(3, 3), pose.reshape(4, 4), 152, 152, lens)
+    cloud = make_cloud(scene, cameras=[camera])
+    expected = unproject(scene["images.side_depth"][0], camera).reshape(-1, 3) - [*WORKSPACE.center, 0.0]
+    valid = cloud.valid[0].numpy()
+    assert valid.sum() > 1000
+    np.testing.assert_allclose(cloud.position[0].numpy()[valid], expected[valid], atol=1e-6)
 
 
 def test_ceiling_removes_the_arm(scene):

@@ -1,5 +1,7 @@
 """Plücker coordinates of a camera's pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import unproject
+from lerobot_symview.geometry.lens import Lens
 from lerobot_symview.geometry.workspace import Workspace
 from tests.helpers.cameras import make_camera, plane_depth
 from tests.helpers.policies import make_config, training_batch
@@ -52,6 +55,35 @@ def test_a_downscaled_pixel_has_the_ray_of_its_centre():
     whole, half = rays(camera), rays(camera, size=(camera.height // 2, camera.width // 2))
     mean = torch.nn.functional.avg_pool2d(whole, 2)
     torch.testing.assert_close(half, mean, atol=1e-5, rtol=0)
+
+
+LENS = Lens("plumb_bob", (-0.27, 0.05, 0.001, -0.002, 0.0))
+
+
+def test_rays_respect_the_lens():
+    camera = replace(make_camera(45, 0), lens=LENS)
+    k, pose = (torch.from_numpy(matrix.reshape(1, -1)) for matrix in (camera.intrinsics, camera.world_from_cam))
+    size = (camera.height, camera.width)
+    direction = plucker_rays(k, pose, size, size, WORKSPACE, [camera])[0, :3].double().permute(1, 2, 0).numpy()
+    points = unproject(np.ones(size), camera) - camera.position
+    np.testing.assert_allclose(direction, points / np.linalg.norm(points, axis=-1, keepdims=True), atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["sideview_nonequi"])
+def test_a_policy_with_rays_reads_the_lens_of_each_observation(method):
+    policy = SymviewBcPolicy(make_config(method=method, camera_rays=True))
+    batch = training_batch(policy.config)
+    key = keys.distortion(policy.config.camera)
+    assert policy.scene.optional_keys == [key]
+    plain, _ = policy.scene.form(batch)
+    none = torch.zeros(len(plain), 9)
+    torch.testing.assert_close(policy.scene.form(batch | {key: none})[0], plain, rtol=0, atol=1e-6)
+    lens = none.clone()
+    lens[0] = torch.from_numpy(LENS.stored())
+    images, _ = policy.scene.form(batch | {key: lens})
+    torch.testing.assert_close(images[1:], plain[1:], rtol=0, atol=1e-6)
+    assert (images[0] - plain[0]).abs().max() > 1e-3
+    assert policy.forward(batch | {key: lens})[0].isfinite()
 
 
 @pytest.mark.parametrize("reflects", [False, True])

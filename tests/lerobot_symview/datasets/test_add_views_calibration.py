@@ -15,13 +15,8 @@ from lerobot.datasets import LeRobotDataset, modify_features
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import (
-    Calibration,
-    parse_calibration,
-    parse_workspace,
-    plain_calibration,
-    read_calibration,
-)
+from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.features import camera_features
 from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings

@@ -223,7 +223,10 @@ def test_other_forms_of_the_same_camera_are_equal():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"distortion": [0.1, 0, 0, 0, 0]}, r"lens distortion is not supported: undistort .* cv2\.undistort"),
+        ({"distortion": [0.1, 0, 0]}, "plumb_bob has 4 or 5 coefficients, got 3"),
+        ({"distortion": [0.1] * 4, "distortion_model": "thin_prism"}, "lens model 'thin_prism' is not supported"),
+        ({"distortion": ["k1"]}, "distortion must be OpenCV's 4, 5 or 8 coefficients"),
+        ({"distortion": [-1.0, 0, 0, 0, 0]}, "lens shows rays only up to .* pixels from the principal point"),
         ({"position": [0, 0, 1]}, "position and quaternion_xyzw belong together"),
         ({"position": [0, 0, 1], "quaternion_xyzw": [1, 1, 0, 0]}, "must have length 1, got 1.41"),
         (

@@ -1,5 +1,7 @@
 """Batched views are bit-identical to the compiled kernels, on the CPU and, if there is one, on a GPU."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_symview.geometry.infill import nearest_known
+from lerobot_symview.geometry.lens import Lens
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, make_view
 from lerobot_symview.views.torch_backend import FrameBatch, can_batch, nearest_known_batch, render_batch
@@ -60,6 +63,22 @@ def test_batches_are_bit_identical_to_single_frames(name, options, device, views
     for output, stacked in images.items():
         for single, image in zip(expected, stacked.cpu().numpy(), strict=True):
             np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, single[output])
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("name", "options"), OPTIONS)
+@pytest.mark.parametrize("coefficients", [((-0.2, 0.05, 0.001, 0.0),) * 2, ((-0.2, 0.05, 0.001, 0.0), None)])
+def test_batches_through_lenses_are_bit_identical_to_single_frames(name, options, device, coefficients):
+    """Of one lens, and of a camera with and one without."""
+    view, camera = make_view(name, size=SIZE, **options), make_camera(elevation=60)
+    camera = replace(camera.resized(SHAPE[0], SHAPE[0]), width=SHAPE[1])
+    lenses = [values and Lens("plumb_bob", values) for values in coefficients]
+    frames = list(frames_of([replace(camera, lens=lens) for lens in lenses], 0))
+    images = render_batch(view, batch_of(frames, device))
+    for index, frame in enumerate(frames):
+        for output, single in view.render(frame).items():
+            image = images[output][index].cpu().numpy()
+            np.testing.assert_array_equal(image.transpose(1, 2, 0) if image.ndim == 3 else image, single)
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -117,6 +117,9 @@ def test_several_photographs_give_intrinsics_and_distortion(run, photos):
     entry = yaml.safe_load(Path("cameras.yaml").read_text())["cameras"]["front"]
     np.testing.assert_allclose(entry["intrinsics"], [615.3, 615.1, 319.5, 239.5], atol=0.7)
     np.testing.assert_allclose(entry["distortion"], DISTORTION, atol=0.02)
+    lens = read_calibration(Path("cameras.yaml")).camera("front").lens
+    assert lens is not None
+    np.testing.assert_allclose(lens.coefficients, entry["distortion"], rtol=1e-6)
     assert pose_errors(CAMERA, np.array(entry["world_from_cam"]))[1] < 1
     assert log.count("reprojection error") == 14  # thirteen views and the pose
     assert "intrinsics from 13 images" in log
