@@ -116,6 +116,8 @@ class Lens:
 def lens_from_coefficients(model: str | None, coefficients: ArrayLike) -> Lens | None:
     """Return the lens of a calibration; None if all its coefficients are zero. Trailing zeros count as absent.
 
+    A lens that is named `equidistant` and has four zeros is one, as in OpenCV: its radius is the angle.
+
     Args:
         model: as for `Lens`; by default `rational_polynomial` for 8 coefficients and `plumb_bob` for fewer.
         coefficients: in OpenCV's order.
@@ -124,7 +126,7 @@ def lens_from_coefficients(model: str | None, coefficients: ArrayLike) -> Lens |
         CalibrationError: for the same reasons as `Lens`.
     """
     values: Array = np.asarray(coefficients, dtype=np.float64).ravel()
-    if not values.any():
+    if not values.any() and (model != EQUIDISTANT or not values.size):
         return None
     most = max(COEFFICIENTS.get(model, (0,))) if model else 8
     if len(values) > most > 0 and not values[most:].any():

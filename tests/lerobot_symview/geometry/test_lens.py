@@ -145,6 +145,13 @@ def test_a_lens_that_distorts_nothing_is_none(lens):
     assert lens_from_coefficients(None, lens.coefficients) is None
 
 
+def test_an_equidistant_lens_of_zeros_distorts_as_in_opencv():
+    lens = lens_from_coefficients("equidistant", [0, 0, 0, 0])
+    assert lens.distort([np.tan(0.5), 0.0])[0] == pytest.approx(0.5)
+    assert lens_from_coefficients("equidistant", []) is None
+    assert lens_from_coefficients("plumb_bob", [0, 0, 0, 0]) is None
+
+
 @every_lens
 def test_a_stored_lens_is_read_back(lens):
     again = stored_lens(lens.stored().astype(np.float32))

@@ -21,6 +21,7 @@ from lerobot_symview.geometry.workspace import Workspace
 HEIGHT, WIDTH = 720, 1280
 FX, FY, CX, CY = 631.54, 630.2, 638.43, 366.49
 LENS = [0.09, -0.18, 0.0005, -0.0003, 0.06]
+LENS_OF_FOUR = [-0.12, 0.03, 0.0005, -0.0003]  # two radial coefficients, which grow up to the corners of the image
 WORKSPACE = Workspace(center=(0.45, 0.05), size=0.4)
 CAMERA = Camera(
     np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]]),
@@ -100,7 +101,7 @@ def kalibr(**changes) -> str:
         "camera_model": "pinhole",
         "intrinsics": [FX, FY, CX, CY],
         "distortion_model": "radtan",
-        "distortion_coeffs": LENS[:4],
+        "distortion_coeffs": LENS_OF_FOUR,
         "resolution": [WIDTH, HEIGHT],
         "T_cam_imu": np.eye(4).tolist(),
     }
