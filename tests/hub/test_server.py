@@ -229,6 +229,7 @@ snapshot_download({DEMO!r}, local_dir={str(tmp_path / "pulled")!r}, ignore_patte
     assert hf_hub_url(DEMO, "x").startswith("https://huggingface.co/")
 
 
+@pytest.mark.long
 def test_lerobot_pushes_and_pulls_datasets(hub, recorded):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 

@@ -29,6 +29,7 @@ NONEQUIVARIANT = ["sideview_nonequi", "sideview_plucker"]
 EQUIVARIANT = [method for method in METHODS if method not in BROKEN + RELAXED + NONEQUIVARIANT]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", EQUIVARIANT)
 def test_methods_are_equivariant_before_and_after_training_and_loading(method, tmp_path):
     policy = make_policy(method=method)
@@ -44,6 +45,7 @@ def test_methods_are_equivariant_before_and_after_training_and_loading(method, t
     assert_equivariant(loaded.double(), tolerance=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", EQUIVARIANT)
 def test_training_loss_is_invariant(method):
     """In training mode without randomness: images have the crop's size, and points are sampled with the same seed."""

@@ -64,6 +64,7 @@ def onnx_policy(policy, folder):
     return run
 
 
+@pytest.mark.long
 def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
     assert_same_policy(onnx_policy(policy, tmp_path), policy, monkeypatch)
 

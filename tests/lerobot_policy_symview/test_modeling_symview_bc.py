@@ -28,6 +28,7 @@ def act(policy, observation, processors=None):
     return postprocess(policy.select_action(preprocess(dict(observation))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", METHODS)
 def test_training_reduces_the_loss_of_every_method(method):
     losses = take_training_steps(make_policy(method=method), count=15, rate=3e-4)
@@ -57,6 +58,7 @@ def test_point_clouds_train_without_the_grippers_height():
     assert losses[-1] < losses[0] / 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "method", ["reproj_equi", "sideview_nonequi", "voxel_equi", "point_cloud_equi", "reproj_equi_relaxed"]
 )

@@ -88,6 +88,7 @@ def test_distortion_is_part_of_the_pose():
     assert pose_errors(camera, found_pose(board, image)[0])[0] > 3 * corrected[0]
 
 
+@pytest.mark.long
 def test_twelve_views_give_intrinsics_and_distortion():
     board, distortion = Board(), (-0.2, 0.08, 0.001, -0.0005)
     views = {
@@ -241,6 +242,7 @@ def test_impossible_boards_are_refused(options, match):
         Board(**options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BOARDS)
 def test_a_board_is_printed_at_its_true_size(name):
     board = BOARDS[name]

@@ -26,6 +26,8 @@ from tests.helpers.boards import K, camera_over, close_views, photograph, pose_e
 from tests.helpers.cameras import plane_depth
 from tests.lerobot_symview.calibration.formats import files
 
+pytestmark = pytest.mark.long
+
 INTRINSICS = "--intrinsics=615.3,615.1,319.5,239.5"
 DISTORTION = (-0.2, 0.08, 0.001, -0.0005)
 CAMERA = camera_over(Board(), 50, 30, 0.8)
