@@ -12,6 +12,8 @@ from lerobot_policy_symview.nn.encoders.point_cloud import SetAbstraction
 from lerobot_symview import keys
 from tests.helpers.policies import make_actor, make_policy
 
+pytestmark = pytest.mark.long
+
 POLICIES = {
     "equivariant": lambda: make_policy(weight_averaging=0.9),
     "plain": lambda: make_actor(method="sideview_nonequi"),
@@ -64,7 +66,6 @@ def onnx_policy(policy, folder):
     return run
 
 
-@pytest.mark.long
 def test_onnx_models_match_the_policy(policy, tmp_path, monkeypatch):
     assert_same_policy(onnx_policy(policy, tmp_path), policy, monkeypatch)
 
@@ -109,7 +110,6 @@ def test_a_configured_calibration_is_part_of_the_program():
     torch.testing.assert_close(program.module()(example), policy.select_action(example), rtol=0, atol=1e-5)
 
 
-@pytest.mark.long
 @FIXED_SIZE
 @pytest.mark.parametrize("method", ["voxel_equi", "point_cloud_equi"])
 def test_policies_on_points_are_exported_and_traced(method, monkeypatch):
@@ -123,7 +123,6 @@ def test_policies_on_points_are_exported_and_traced(method, monkeypatch):
         assert_same_policy(again, policy, monkeypatch)
 
 
-@pytest.mark.long
 def test_onnx_models_of_voxels_match_the_policy(tmp_path, monkeypatch):
     policy = with_biases(make_policy(method="voxel_equi"))
     assert_same_policy(onnx_policy(policy, tmp_path), policy, monkeypatch)
