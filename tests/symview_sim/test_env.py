@@ -172,6 +172,7 @@ def test_episodes_are_bit_identical_across_processes(task):
     assert len(digests.pop()) == 64
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_an_episode_does_not_depend_on_those_before_it(task):
     """Workers simulate episodes in any order, with the same result (Bullet violated this twice)."""
@@ -208,6 +209,7 @@ def _expert_states(env, seed):
     return np.array(states)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_the_expert_succeeds(task, robot):
