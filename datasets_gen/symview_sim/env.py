@@ -19,7 +19,7 @@ from symview_sim.rendering import CameraImages, render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
 from symview_sim.settings import EnvSettings
-from symview_sim.sight import place_in_sight, resized
+from symview_sim.sight import place_in_sight
 from symview_sim.tasks import make_task
 
 START_HEIGHT = 0.2  # metres
@@ -123,7 +123,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8]:
         """Return the first camera's image, (256, W, 3) uint8."""
         camera = next(iter(self.cameras.values()))
-        return render(self.scene.client, resized(camera, RENDER_HEIGHT)).rgb
+        return render(self.scene.client, camera.resized(RENDER_HEIGHT)).rgb
 
     def close(self) -> None:
         """Shut the simulator down."""

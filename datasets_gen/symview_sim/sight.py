@@ -49,16 +49,8 @@ def place_in_sight(
 
 def seen_fraction(client: Any, camera: Camera, workspace: Workspace) -> float:
     """Return the fraction of the workspace's pixels in a camera's image that do not show the robot; 0 without any."""
-    camera = resized(camera, PIXELS)
+    camera = camera.resized(PIXELS)
     _, _, inside = table_rays(camera, workspace)
     labels = render(client, camera, labelled=True).labels
     assert labels is not None
     return float((labels[inside] != ROBOT).mean()) if inside.any() else 0.0
-
-
-def resized(camera: Camera, height: int) -> Camera:
-    """Return the camera with an image of `height` rows that shows the same."""
-    scale = height / camera.height
-    intrinsics = camera.intrinsics * [[scale], [scale], [1]]
-    intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
-    return Camera(intrinsics, camera.world_from_cam, height, round(scale * camera.width))

@@ -20,8 +20,9 @@ from lerobot_symview.datasets.add_views import (
     views_for_dataset,
 )
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
-from lerobot_symview.datasets.features import Features
-from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, is_depth_feature
+from lerobot_symview.datasets.features import Features, is_depth_feature
+from lerobot_symview.datasets.frame_reader import FrameReader
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.geometry.camera import Camera, project
 from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE
 from lerobot_symview.geometry.workspace import Workspace

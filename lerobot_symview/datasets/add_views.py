@@ -29,13 +29,15 @@ from lerobot_symview.datasets.derivation import (
 from lerobot_symview.datasets.features import (
     Features,
     calibration_features,
+    gripper_dimensions,
     image_size,
     stored_workspace,
     view_features,
 )
+from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
-from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset, gripper_dimensions
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace

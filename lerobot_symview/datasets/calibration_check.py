@@ -8,7 +8,8 @@ from dataclasses import replace
 from lerobot_symview import keys
 from lerobot_symview.calibration.table_plane import TablePlane, check_table, has_depth, likely_depth_unit
 from lerobot_symview.datasets.features import declared_unit
-from lerobot_symview.datasets.source import EpisodeTables, FrameReader
+from lerobot_symview.datasets.frame_reader import FrameReader
+from lerobot_symview.datasets.source import EpisodeTables
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.units import METRES, unit_name
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, MINIMUM_VISIBLE, check_camera

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
+from lerobot_symview.datasets.features import is_depth_feature
 from lerobot_symview.datasets.metadata import RECORDING, read_settings
-from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, is_depth_feature
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 
 CARD, IMAGE = "README.md", "meta/symview_image.png"
 SHOWN_FRAME = 2  # index in the first episode: the arm is in the image and the gripper moves

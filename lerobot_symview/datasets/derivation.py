@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
 from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
 from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
-from lerobot_symview.datasets.source import EpisodeTables, FrameReader, SourceDataset
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of
 from lerobot_symview.views import View

@@ -126,3 +126,16 @@ def stored_workspace(features: Features) -> Workspace:
             except CalibrationError as error:
                 raise CalibrationError(f"the workspace declared by {key}: {error}") from None
     return Workspace()
+
+
+def is_depth_feature(feature: dict[str, Any]) -> bool:
+    """Whether a feature declares depth or height images."""
+    return bool((feature.get("info") or {}).get("is_depth_map"))
+
+
+def gripper_dimensions(features: Features) -> list[int] | None:
+    """Return the indices of the gripper's x, y, z, yaw and aperture in the state; None if any is missing."""
+    names = features.get(keys.STATE, {}).get("names")
+    if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
+        return None
+    return [names.index(name) for name in keys.STATE_NAMES]

@@ -96,8 +96,14 @@ class Camera:
         """What the ideal pixels of its image depend on: lens, fx, fy, cx, cy, height and width."""
         return self.lens, self.fx, self.fy, self.cx, self.cy, self.height, self.width
 
-    def resized(self, height: int, width: int) -> Camera:
-        """Return the camera of the image after a change of its size; the field of view is the same."""
+    def resized(self, height: int, width: int | None = None) -> Camera:
+        """Return the camera of the image after a change of its size; the field of view is the same.
+
+        Args:
+            height: image rows.
+            width: image columns; by default in proportion to the rows.
+        """
+        width = round(height / self.height * self.width) if width is None else width
         scale = np.array([width / self.width, height / self.height])
         intrinsics = self.intrinsics.copy()
         intrinsics[:2] *= scale[:, None]

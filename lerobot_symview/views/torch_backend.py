@@ -135,7 +135,7 @@ def zbuffer_batch(
         torch.from_numpy(np.array(values)).to(depth.device)
         for values in ([ray for ray, _ in matrices], [start for _, start in matrices], ceilings)
     )
-    u, v = _ideal_pixels(cameras, depth.device)
+    u, v = ideal_pixels_batch(cameras, depth.device)
     distance = depth.double()
     rays, origin = rays[..., None, None], origin[..., None, None]  # (B, 3, 3, 1, 1) and (B, 3, 1, 1)
     row, column, z = (
@@ -157,8 +157,8 @@ def zbuffer_batch(
     return torch.where(source == EMPTY, torch.zeros_like(height), height), source
 
 
-def _ideal_pixels(cameras: list[Camera], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the ideal pixels of the cameras, u and v, that broadcast to (B, H, W)."""
+def ideal_pixels_batch(cameras: list[Camera], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the ideal pixels, u and v, of B cameras with images of one size; they broadcast to (B, H, W)."""
     if len({camera.optics for camera in cameras}) == 1 or all(camera.lens is None for camera in cameras):
         return _ideal_pixels_on(device, cameras[0].optics)
     size = (cameras[0].height, cameras[0].width)

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
+from lerobot_symview.datasets.features import is_depth_feature
 from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb
-from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, is_depth_feature
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.errors import CalibrationError, DatasetError
 
 logger = logging.getLogger(__name__)

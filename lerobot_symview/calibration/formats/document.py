@@ -110,5 +110,5 @@ def _arrays(data: bytes) -> Any:
         return {name: loaded[name].tolist() for name in loaded.files}
     except (EOFError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(str(error)) from None
-    except NotImplementedError as error:  # of zipfile: a compression that Python lacks, or encryption
+    except RuntimeError as error:  # zipfile's for an encrypted archive and for a compression that Python lacks
         raise ValueError(f"{error}: save it with np.savez") from None

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_symview.geometry.camera import Camera, ideal_pixels
+from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views.torch_backend import ideal_pixels_batch
 
 
 def pixel_rays(
@@ -27,25 +27,14 @@ def pixel_rays(
     k = intrinsics.double().view(-1, 3, 3)
     if cameras is None:
         v, u = (torch.arange(count, dtype=torch.float64, device=k.device) for count in size)
-        u, v = u[None, None], v[None, :, None]
+        v = v[:, None]
     else:
-        u, v = _ideal_pixels(cameras, size, k.device)
+        u, v = ideal_pixels_batch([camera.resized(*size) for camera in cameras], k.device)
     v, u = ((axis + 0.5) * full / count - 0.5 for axis, full, count in zip((v, u), calibrated, size, strict=True))
     x = (u - k[:, 0, 2, None, None]) / k[:, 0, 0, None, None]
     y = (v - k[:, 1, 2, None, None]) / k[:, 1, 1, None, None]
     x, y = x.expand(-1, *size), y.expand(-1, *size)
     return torch.stack([x, y, torch.ones_like(x)], dim=-1)
-
-
-def _ideal_pixels(cameras: Sequence[Camera], size: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the ideal pixels, u and v, (1, h, w) or (B, h, w), of resized images."""
-    resized = [camera.resized(*size).optics for camera in cameras]
-    distinct = {optics: ideal_pixels(optics) for optics in resized}
-    if len(distinct) == 1:
-        resized = resized[:1]
-    maps = [np.broadcast_arrays(*distinct[optics]) for optics in resized]
-    u, v = (torch.from_numpy(np.stack(planes)).to(device) for planes in zip(*maps, strict=True))
-    return u, v
 
 
 def plucker_rays(

@@ -202,3 +202,11 @@ def test_a_malformed_file_is_a_calibration_error_or_valid(write, name, variant):
 def test_a_huge_file_is_not_read(write):
     with pytest.raises(CalibrationError, match="more than 16 MB"):
         read_calibration(write(b"1 " * (9 * 2**20)))
+
+
+def test_an_encrypted_archive_says_so(write):
+    archive = bytearray(files.maniskill_npz())
+    for header, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):  # in front of each member, and in the directory
+        archive[archive.index(header) + flags] |= 1
+    with pytest.raises(CalibrationError, match="encrypted.*save it with np.savez"):
+        read_calibration(write(bytes(archive)), "front", SIZE, files.WORKSPACE)

@@ -1,0 +1,121 @@
+"""Reader of the frames that views are rendered from, in a LeRobot dataset on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from itertools import islice, repeat
+from typing import Any
+
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from lerobot_symview import keys
+from lerobot_symview.calibration.file import Calibration
+from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature
+from lerobot_symview.datasets.source import SourceDataset, vectors
+from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.views import Frame, View
+
+
+@dataclass(frozen=True)
+class FrameReader:
+    """Reader of one camera's frames.
+
+    Args:
+        dataset: the dataset.
+        camera: name of the camera.
+        workspace: the square on the table that views show.
+        views: the views to render; they determine whether depth and the gripper's state are read.
+        calibration: calibration of the camera if it is not in the dataset.
+        depth_unit: metres per unit of the camera's depth; by default what the dataset declares, or its values suggest.
+    """
+
+    dataset: SourceDataset
+    camera: str
+    workspace: Workspace
+    views: Collection[View]
+    calibration: Calibration | None = None
+    depth_unit: float | None = None
+
+    @property
+    def depth(self) -> bool:
+        """Whether a view needs depth."""
+        return any(view.needs_depth for view in self.views)
+
+    @property
+    def gripper(self) -> bool:
+        """Whether a view uses the gripper's state and the dataset has it."""
+        return any(view.uses_gripper for view in self.views) and gripper_dimensions(self.dataset.features) is not None
+
+    def features(self) -> list[str]:
+        """Return the keys of the features that `frames` requires."""
+        required = [keys.rgb(self.camera), "timestamp"]
+        required += [keys.depth(self.camera)] if self.depth else []
+        required += [keys.STATE] if self.gripper else []
+        if self.calibration is None:
+            required += self._calibration()
+        return required
+
+    def _calibration(self) -> list[str]:
+        """Return the keys of the stored calibration: intrinsics, pose, and distortion if the dataset has it."""
+        *needed, distortion = keys.calibration(self.camera)
+        return [*needed, distortion] if distortion in self.dataset.features else needed
+
+    def columns(self) -> list[str]:
+        """Return the table columns that `frames` reads: its features except videos."""
+        features = self.dataset.features
+        return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
+
+    def check(self) -> None:
+        """Raise a DatasetError that lists the required features that the dataset lacks."""
+        features = self.dataset.features
+        missing = [key for key in self.columns() if key not in features]
+        depth = keys.depth(self.camera)
+        if self.depth and depth in features and not is_depth_feature(features[depth]):
+            missing.append(f"{depth} as a depth feature")
+        if self.depth and depth not in missing and depth in features:
+            check_depth_size(self.camera, features[depth]["shape"], features[keys.rgb(self.camera)]["shape"])
+        if missing:
+            cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
+            raise DatasetError(
+                f"the dataset lacks {', '.join(missing)}; cameras with calibration: {', '.join(cameras) or 'none'}"
+            )
+
+    def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
+        """Yield the frames of an episode; `table` holds its rows.
+
+        Raises:
+            CalibrationError: if a frame's calibration is invalid.
+        """
+        colors = self.dataset.images(keys.rgb(self.camera), episode, table)
+        depths: Iterator[Any] = repeat(None)
+        if self.depth:
+            depths = self.dataset.images(keys.depth(self.camera), episode, table, self.depth_unit)
+        states: Iterator[Any] = repeat(None)
+        if self.gripper:
+            states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
+        calibrations: Iterator[Any] = repeat(None)
+        if self.calibration is None:
+            calibrations = zip(*(vectors(table, key) for key in self._calibration()), strict=True)
+        steps = zip(colors, depths, states, calibrations, strict=False)
+        for index, (rgb, depth, state, stored) in enumerate(islice(steps, len(table))):
+            try:
+                camera = self._camera(stored, *rgb.shape[:2])
+            except CalibrationError as error:
+                raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
+            yield Frame(rgb, depth, camera, self.workspace, state)
+
+    def _camera(self, stored: tuple[NDArray, ...] | None, height: int, width: int) -> Camera:
+        if stored is not None:
+            intrinsics, world_from_cam, *distortion = stored
+            return stored_camera(intrinsics, world_from_cam, height, width, *distortion)
+        assert self.calibration is not None
+        camera = self.calibration.camera(self.camera)
+        if (camera.height, camera.width) != (height, width):
+            raise CalibrationError(
+                f"the calibration is for {camera.height} x {camera.width} pixels, the images have {height} x {width}"
+            )
+        return camera
