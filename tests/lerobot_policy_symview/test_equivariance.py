@@ -19,6 +19,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
+from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
 from lerobot_symview.views import ViewSpec
 from symview_sim.settings import EnvSettings
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
@@ -219,6 +220,18 @@ def test_policies_are_equivariant_from_the_raw_image(raw, method, options, rotat
     assert max(errors[element] for element in (4, 5, 6, 7)) < reflected_tolerance
     fixed_camera_errors = equivariance_errors(policy, observation=raw, camera="stays")
     assert max(fixed_camera_errors.values()) > max(rotated_tolerance, reflected_tolerance)
+
+
+@pytest.mark.parametrize(("method", "options"), [("persp_equi", {"size": 76}), ("voxel_equi", {})])
+def test_policies_are_equivariant_from_the_raw_image_of_a_lens(raw, method, options):
+    policy = make_policy(method=method, view=ViewSpec(METHODS[method]["view"], options))
+    take_training_steps(policy)
+    lens = torch.from_numpy(Lens(PLUMB_BOB, (-0.2, 0.05, 0.01, 0.02)).stored()).float()
+    observation = raw | {keys.distortion("side"): lens[None]}
+    assert max(equivariance_errors(policy, observation=observation).values()) < 1e-4
+    preprocess, _ = make_symview_bc_pre_post_processors(policy.config)
+    through_lens, straight = (policy.select_action(preprocess(dict(each))) for each in (observation, raw))
+    assert not torch.allclose(through_lens, straight, atol=1e-3)
 
 
 def test_inverse_transform_restores_the_observation():

@@ -208,5 +208,5 @@ def test_an_encrypted_archive_says_so(write):
     archive = bytearray(files.maniskill_npz())
     for header, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):  # in front of each member, and in the directory
         archive[archive.index(header) + flags] |= 1
-    with pytest.raises(CalibrationError, match="encrypted.*save it with np.savez"):
+    with pytest.raises(CalibrationError, match=r"encrypted.*save it with np\.savez"):
         read_calibration(write(bytes(archive)), "front", SIZE, files.WORKSPACE)
