@@ -143,18 +143,20 @@ def _train(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
 
 def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
     """Start or resume `symview-train-rl` for a cell, and return its evaluations."""
-    cell, scale = job.cell, job.cell.scale
+    cell = job.cell
     config = TrainRlConfig(
         dataset=job.demonstrations,
         env=env,
-        policy=SymviewSacfdConfig(device=job.device, push_to_hub=False, **scale.policy, **cell.row.policy_options),
+        policy=SymviewSacfdConfig(
+            device=job.device, push_to_hub=False, **cell.scale.policy(cell.algorithm), **cell.row.policy_options
+        ),
         output_dir=job.output,
         steps=cell.steps,
-        batch_size=scale.batch_size,
+        batch_size=cell.batch_size,
         num_simulators=RL_SIMULATORS,
         seed=cell.seed,
-        eval_every=scale.rl_eval_every,
-        eval_episodes=scale.eval_episodes,
+        eval_every=cell.eval_every,
+        eval_episodes=cell.eval_episodes,
         resume=True,
     )
     try:
@@ -167,8 +169,8 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
     return [
         Checkpoint(
             step=int(row["step"]),
-            successes=round(row["success"] * scale.eval_episodes),
-            episodes=scale.eval_episodes,
+            successes=round(row["success"] * cell.eval_episodes),
+            episodes=cell.eval_episodes,
             mean_return=row["return"],
             loss=float("nan"),
         )

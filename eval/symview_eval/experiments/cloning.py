@@ -112,8 +112,7 @@ def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
     config = SymviewBcConfig(
         device=device,
         push_to_hub=False,
-        learning_rate_decay=cell.scale.learning_rate_decay,
-        **cell.scale.policy,
+        **cell.scale.policy(cell.algorithm),
         **cell.row.policy_options,
     )
     config.limit_view()
@@ -139,10 +138,9 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
     preset = config.get_optimizer_preset()
     optimizer: Any = preset.build(policy.get_optim_params())
     schedule = config.get_scheduler_preset()
-    scheduler = schedule.build(optimizer, scale.steps) if schedule is not None else None
+    scheduler = schedule.build(optimizer, cell.steps) if schedule is not None else None
     accelerator = Accelerator(cpu=device == "cpu")
-    evaluations = scale.steps // scale.eval_every
-    first_seed = EVALUATION_SEED + cell.seed * evaluations * scale.eval_episodes
+    first_seed = EVALUATION_SEED + cell.seed * scale.evaluations * scale.eval_episodes
     pending: list[tuple[int, float, Future[Evaluation]]] = []
     with (
         Simulators(simulator_config(config, env), scale.simulators) as simulators,
@@ -150,9 +148,9 @@ def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> Clon
     ):
         metrics = _metrics(scale.batch_size)
         ready = time.perf_counter()
-        for step in range(1, scale.steps + 1):
+        for step in range(1, cell.steps + 1):
             update_policy(metrics, policy, next(batches), optimizer, preset.grad_clip_norm, accelerator, scheduler)
-            if step % scale.eval_every == 0:
+            if step % cell.eval_every == 0:
                 pending.append((step, metrics.loss.avg, evaluator.submit(policy)))
                 metrics.reset_averages()
         trained = time.perf_counter()

@@ -7,17 +7,16 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lerobot_policy_symview.methods import METHODS
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.registry import lookup
 from lerobot_symview.views import ViewSpec
-from symview_eval.experiments.scale import Scale
+from symview_eval.experiments.scale import Algorithm, Scale
 from symview_sim.tasks import TASK_NAMES
 
-Algorithm = Literal["bc", "sacfd"]
-HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps, for SACfD
+HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps for SACfD
 RL_DEMONSTRATIONS, RL_DEMONSTRATIONS_HARDER = 20, 50
 
 
@@ -90,27 +89,41 @@ class Cell:
     @property
     def steps(self) -> int:
         """Training steps of behaviour cloning, or joint steps of reinforcement learning."""
+        is_harder = self.task in HARDER_TASKS
         if self.algorithm == "bc":
-            return self.scale.steps
-        return self.scale.rl_steps * (2 if self.task in HARDER_TASKS else 1)
+            return self.scale.harder_steps if is_harder else self.scale.steps
+        return self.scale.rl_steps * (2 if is_harder else 1)
+
+    @property
+    def batch_size(self) -> int:
+        """Frames or transitions per step."""
+        return self.scale.batch_size if self.algorithm == "bc" else self.scale.rl_batch_size
+
+    @property
+    def eval_every(self) -> int:
+        """Steps between evaluations during the training."""
+        return self.steps // self.scale.evaluations if self.algorithm == "bc" else self.scale.rl_eval_every
+
+    @property
+    def eval_episodes(self) -> int:
+        """Episodes per evaluation."""
+        return self.scale.eval_episodes if self.algorithm == "bc" else self.scale.rl_eval_episodes
 
     @property
     def training(self) -> dict[str, Any]:
         """All settings that determine its policy and the evaluations during the training."""
         scale = self.scale
-        evaluation = [scale.eval_every if self.algorithm == "bc" else scale.rl_eval_every, scale.eval_episodes]
         return {
             "algorithm": self.algorithm,
-            "policy": {**scale.policy, **self.row.policy},
-            "learning_rate_decay": scale.learning_rate_decay if self.algorithm == "bc" else "none",
+            "policy": {**scale.policy(self.algorithm), **self.row.policy},
             "elevation_deg": self.row.camera.elevation_deg,
             **({"spread": asdict(self.row.camera.spread)} if self.row.camera.varies else {}),
             "task": self.task,
             "demonstrations": self.demonstrations,
             "seed": self.seed,
             "steps": self.steps,
-            "batch_size": scale.batch_size,
-            "evaluation": [*evaluation, scale.max_steps],
+            "batch_size": self.batch_size,
+            "evaluation": [self.eval_every, self.eval_episodes, scale.max_steps],
         }
 
     @property
@@ -125,7 +138,8 @@ class Cell:
         Cells of two tables with equal hashes share one run.
         """
         cameras = {name: asdict(camera) for name, camera in self.placements}
-        return _hash(self.training | {"placements": cameras}) if cameras else self.training_hash
+        episodes = self.scale.placement_episodes
+        return _hash(self.training | {"placements": cameras, "episodes": episodes}) if cameras else self.training_hash
 
     def __str__(self) -> str:
         return f"{self.row.name} on {self.task}, {self.demonstrations} demonstrations, seed {self.seed}"

@@ -23,8 +23,8 @@ def evaluate_placements(cell: Cell, policy: SymviewPolicy, env: EnvSettings) -> 
         env: environment of the evaluations, but for its camera.
     """
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    first_seed = EVALUATION_SEED + cell.seed * cell.scale.eval_episodes
-    seeds = range(first_seed, first_seed + cell.scale.eval_episodes)
+    first_seed = EVALUATION_SEED + cell.seed * cell.scale.placement_episodes
+    seeds = range(first_seed, first_seed + cell.scale.placement_episodes)
     actor, checkpoints, simulated_s = Actor(policy), [], 0.0
     for name, camera in cell.placements:
         config = simulator_config(policy.config, replace(env, camera=camera))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,10 @@ TRANSFER_TASKS = ("block_picking", "block_pushing", "drawer_opening")
 
 @dataclass(frozen=True)
 class Costs:
-    """Processor seconds that cells took: of the same method and task, else of the method, else of all cells."""
+    """Seconds that cells took: of the same method and task, else of the method, else of all cells.
+
+    They are processor seconds, and wall-clock seconds for reinforcement learning, whose processor time is not measured.
+    """
 
     medians: dict[tuple[str, ...], float] = field(default_factory=dict)
 
@@ -30,14 +34,14 @@ class Costs:
         seconds: dict[tuple[str, ...], list[float]] = {}
         for path, result in finished.items():
             table, _, task, row = path.parts[:4]  # as in `Cell.path`
-            cell_seconds = result.times.cpu_s
-            if cell_seconds > 0 and row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
+            cell_seconds = result.origin.seconds if math.isnan(result.times.cpu_s) else result.times.cpu_s
+            if row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
                 for key in _keys(EXPERIMENTS[table], rows[row].policy["method"], task):
                     seconds.setdefault(key, []).append(cell_seconds)
         return cls({key: statistics.median(values) for key, values in seconds.items()})
 
     def seconds(self, cell: Cell) -> float | None:
-        """Return the expected processor seconds of a cell; None before any cell of its algorithm is finished."""
+        """Return the expected seconds of a cell; None before any cell of its algorithm is finished."""
         for key in _keys(EXPERIMENTS[cell.experiment], cell.row.policy["method"], cell.task):
             if key in self.medians:
                 return self.medians[key]

@@ -7,7 +7,7 @@ import io
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import MISSING, asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -158,5 +158,4 @@ def _text(value: float | str) -> str:
 def _parsed(dataclass_type: Any, texts: dict[str, str]) -> dict[str, Any]:
     """Return the values of a dataclass's fields, converted to the fields' types."""
     types = {"int": int, "float": float, "str": str}
-    named = [item for item in fields(dataclass_type) if item.name in texts or item.default is MISSING]
-    return {item.name: types[str(item.type)](texts[item.name]) for item in named}
+    return {item.name: types[str(item.type)](texts[item.name]) for item in fields(dataclass_type)}

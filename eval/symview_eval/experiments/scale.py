@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
+Algorithm = Literal["bc", "sacfd"]
+
 
 @dataclass(frozen=True)
 class Scale:
@@ -18,16 +20,24 @@ class Scale:
     """Rows and columns of the crop that the network takes, pixels."""
     steps: int
     """Training steps of behaviour cloning."""
+    harder_steps: int
+    """Training steps of behaviour cloning for the harder tasks."""
     batch_size: int
-    """Frames or transitions per training step."""
-    eval_every: int
-    """Training steps of behaviour cloning between evaluations."""
+    """Frames per training step of behaviour cloning."""
+    evaluations: int
+    """Evaluations of behaviour cloning, after equal numbers of training steps, the last one after the last step."""
     eval_episodes: int
-    """Episodes per evaluation."""
+    """Episodes per evaluation of behaviour cloning."""
+    placement_episodes: int
+    """Episodes per camera, in experiments with several cameras."""
     rl_steps: int
     """Joint steps of reinforcement learning (five simulators act, one update); twice as many for the harder tasks."""
+    rl_batch_size: int
+    """Transitions per joint step."""
     rl_eval_every: int
     """Joint steps between evaluations."""
+    rl_eval_episodes: int
+    """Episodes per evaluation of reinforcement learning."""
     simulators: int
     """Simulators that evaluate in parallel (behaviour cloning)."""
     seeds: int = 3
@@ -40,13 +50,15 @@ class Scale:
     """Decay of the exponential moving average of the weights, which is evaluated; 0 turns it off."""
     learning_rate_decay: Literal["none", "cosine"] = "none"
     """Learning rate schedule of behaviour cloning; `cosine` decays the rate to zero."""
+    aperture_noise: float = 0.0
+    """Noise on the gripper's aperture in the training of behaviour cloning."""
     dtype: str = "float32"
     """Precision of convolutions."""
 
-    @property
-    def policy(self) -> dict[str, Any]:
-        """Policy settings that the scale determines."""
-        names = ("width", "crop_size", "weight_averaging", "dtype")
+    def policy(self, algorithm: Algorithm) -> dict[str, Any]:
+        """Return the policy settings that the scale determines."""
+        names = ["width", "crop_size", "weight_averaging", "dtype"]
+        names += ["learning_rate_decay", "aperture_noise"] if algorithm == "bc" else []
         return {name: getattr(self, name) for name in names}
 
     def __str__(self) -> str:
@@ -61,11 +73,15 @@ SCALES = {
             width=64,
             crop_size=128,
             steps=5000,
+            harder_steps=5000,
             batch_size=128,
-            eval_every=200,
+            evaluations=25,
             eval_episodes=100,
+            placement_episodes=100,
             rl_steps=5000,
+            rl_batch_size=128,
             rl_eval_every=200,
+            rl_eval_episodes=100,
             simulators=16,
             dtype="bfloat16",
         ),
@@ -73,26 +89,35 @@ SCALES = {
             "laptop",
             width=16,
             crop_size=64,
-            steps=1000,
-            batch_size=16,
-            eval_every=200,
-            eval_episodes=20,
+            steps=2000,
+            harder_steps=4000,
+            batch_size=8,
+            evaluations=1,
+            eval_episodes=60,
+            placement_episodes=20,
             rl_steps=400,
+            rl_batch_size=32,
             rl_eval_every=100,
+            rl_eval_episodes=20,
             simulators=4,
             weight_averaging=0.99,
             learning_rate_decay="cosine",
+            aperture_noise=0.03,
         ),
         Scale(
             "smoke",
             width=16,
             crop_size=64,
             steps=2,
+            harder_steps=2,
             batch_size=2,
-            eval_every=1,
+            evaluations=2,
             eval_episodes=1,
+            placement_episodes=1,
             rl_steps=2,
+            rl_batch_size=2,
             rl_eval_every=1,
+            rl_eval_episodes=1,
             simulators=1,
             seeds=1,
             max_steps=2,

@@ -3,9 +3,9 @@
 import csv
 import dataclasses
 import json
-import math
 import os
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -26,6 +26,8 @@ from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import placement_entries, table_entries
 
 pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).parents[3]
 
 
 def config(folder, **chosen):
@@ -253,27 +255,16 @@ def test_a_report_without_results_names_the_remedy(tmp_path):
 
 
 def test_the_report_covers_the_committed_results(tmp_path):
-    results = Path(__file__).parents[3] / "results"
+    results = ROOT / "results"
     page = report(ReportConfig(results, tmp_path)).read_text()
     assert "computed with other settings" not in page
     entries = table_entries(EXPERIMENTS["table1"], "laptop", results)
     assert sum(len(entry.results) for entry in entries) == len(list((results / "table1" / "laptop").rglob("*.csv")))
 
 
-def test_success_rates_in_the_documentation_match_the_committed_results():
-    """They are written as `83 (85), mean 60`: best checkpoint, the paper's rate, mean of the last five checkpoints."""
-    root = Path(__file__).parents[3]
-    documented, measured = set(), set()
-    for page in (root / "README.md", *(root / "docs").glob("*.md")):
-        text = re.sub(r"\s+", " ", page.read_text())
-        documented |= set(re.findall(r"\d+(?: \(\d+\))?, mean \d+", text))
-    for experiment in EXPERIMENTS.values():
-        for entry in table_entries(experiment, "laptop", root / "results"):
-            paper = "" if math.isnan(entry.paper) else f" ({percent(entry.paper)})"
-            measured.add(f"{percent(entry.best.mean)}{paper}, mean {percent(entry.last_five.mean)}")
-    assert len(documented) > 20
-    assert documented <= measured
-
-
-def percent(rate):
-    return math.floor(100 * rate + 0.5 + 1e-9)  # rounds halves up, as the documentation does
+def test_tables_in_the_documentation_are_those_of_the_committed_results():
+    tool = runpy.run_path(str(ROOT / "tools" / "results.py"))
+    for page in tool["PAGES"]:
+        text = page.read_text()
+        assert tool["TABLE"].search(text)
+        assert tool["updated"](text, ROOT / "results") == text, f"{page.name}: run python tools/results.py"

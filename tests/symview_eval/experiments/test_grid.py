@@ -24,7 +24,7 @@ def test_every_row_configures_a_policy(name, scale):
     for row in EXPERIMENTS[name].rows:
         cell = cells(name, scale, methods=[row.name])[0]
         if cell.algorithm == "sacfd":
-            policy = SymviewSacfdConfig(device="cpu", **scale.policy, **row.policy)
+            policy = SymviewSacfdConfig(device="cpu", **scale.policy(cell.algorithm), **row.policy)
         else:
             policy = policy_config(cell, "cpu")
         assert policy.method == row.policy["method"]

@@ -68,6 +68,10 @@ def test_costs_are_medians_of_the_nearest_results(tmp_path):
     assert seconds("table4", "drawer_opening", "reproj_equi_local") == 100.0  # the same method, another task
     assert seconds("table1", "drawer_opening", "voxel_equi") == 95.0  # the median of all four
     assert seconds("figure5", "block_picking", "reproj_equi") is None  # no reinforcement learning was measured
+    (cell,) = select(EXPERIMENTS["figure5"], LAPTOP, ["block_picking"], ["reproj_equi"], seeds=[0])
+    write_result(tmp_path / cell.path, replace(result(), times=Times()))
+    costs = Costs.measured(finished_results(tmp_path, "laptop"))
+    assert seconds("figure5", "block_picking", "oracle_equi") == 101.5  # wall-clock, its only time
 
 
 def test_what_remains_counts_each_run_once():
