@@ -42,9 +42,32 @@ def distortion(camera: str) -> str:
     return f"{CALIBRATIONS}{camera}.distortion"
 
 
-def calibration(camera: str) -> list[str]:
-    """Features that the calibration of `camera` may have: intrinsics, pose, and distortion if it has a lens."""
-    return [intrinsics(camera), world_from_cam(camera), distortion(camera)]
+def depth_intrinsics(camera: str) -> str:
+    """float32 (9,) K of the depth sensor in pixels, row-major; absent where depth is aligned with colour."""
+    return f"{CALIBRATIONS}{camera}.depth_intrinsics"
+
+
+def color_from_depth(camera: str) -> str:
+    """float32 (16,) depth-to-colour transform, row-major, metres; absent where depth is aligned with colour."""
+    return f"{CALIBRATIONS}{camera}.color_from_depth"
+
+
+def calibration(camera: str, names: Collection[str] | None = None) -> list[str]:
+    """Features of the calibration of `camera`: intrinsics and pose, then those that only some cameras have.
+
+    Their last parts are the parameters of `stored_camera`.
+
+    Args:
+        camera: name of the camera.
+        names: the features of an observation or dataset; by default it has all.
+    """
+    some = [distortion(camera), depth_intrinsics(camera), color_from_depth(camera)]
+    return [intrinsics(camera), world_from_cam(camera), *(key for key in some if names is None or key in names)]
+
+
+def parameter(key: str) -> str:
+    """Return the last part of the key of a calibration's feature, such as `intrinsics`."""
+    return key.rpartition(".")[2]
 
 
 def view(camera: str, output: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lerobot_symview.calibration.board_corners import Corners
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, calibration_problems, invert_rigid
+from lerobot_symview.geometry.camera import Array, DepthSensor, calibration_problems, invert_rigid
 
 CORNER_NOISE = 0.1  # pixels: corners in photographs are not located better
 LARGE_ERROR = 0.003  # of the image's width: RMS reprojection error beyond which corners and camera disagree
@@ -33,10 +33,12 @@ class Intrinsics:
     Args:
         matrix: (3, 3) float64, K in pixels.
         distortion: (N,) float64, OpenCV's coefficients k1, k2, p1, p2, k3, ...; empty = none.
+        depth_sensor: the camera of its depth images; None where these are aligned with colour.
     """
 
     matrix: Array
     distortion: Array = field(default_factory=lambda: np.zeros(0))
+    depth_sensor: DepthSensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +161,10 @@ def estimate_intrinsics(views: Mapping[str, Corners], height: int, width: int) -
             f"and at most {MOST_UNCERTAIN_FOCAL:.1%}: add images in which the board leans to the left, the right, "
             "forward and back, near the image's corners too"
         )
-    problems = calibration_problems(matrix, np.eye(4), height, width)
+    problems = calibration_problems(matrix, np.eye(4), (height, width))
     if problems:
         raise CalibrationError(f"the images give impossible intrinsics: {'; '.join(problems)}; add images")
-    return EstimatedIntrinsics(matrix, distortion.ravel()[:4], errors_px, uncertainty)
+    return EstimatedIntrinsics(matrix, distortion.ravel()[:4], errors_px=errors_px, uncertainty=uncertainty)
 
 
 def world_from_cam(pose: BoardPose, world_from_board: Array) -> Array:

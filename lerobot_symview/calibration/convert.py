@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_symview.calibration.file import POSES, parse_calibration, parse_workspace
+from lerobot_symview.calibration.file import POSES, parse_calibration, parse_workspace, plain_depth_sensor
 from lerobot_symview.calibration.formats import FORMATS, CameraFacts, Facts, Format, parse, recognise
 from lerobot_symview.calibration.formats.document import Document, read_document
 from lerobot_symview.calibration.formats.facts import Pose, Size
 from lerobot_symview.calibration.readings import PoseReading, resolve
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import DepthSensor
 from lerobot_symview.geometry.workspace import Workspace
 
 HAS_INTRINSICS = "ROS camera_info, OpenCV's camera_matrix, Kalibr's camchain or RealSense's JSON"
@@ -139,6 +140,9 @@ def _from_facts(file: Path, facts: CameraFacts) -> _Source:
         parts["image size"] = dict(zip(("height", "width"), facts.size, strict=True))
     if facts.depth_unit is not None:
         parts["depth unit"] = {"depth_unit": facts.depth_unit}
+    if facts.depth_intrinsics is not None and facts.color_from_depth is not None:
+        sensor = DepthSensor(facts.depth_intrinsics, facts.color_from_depth)
+        parts["depth sensor"] = plain_depth_sensor(sensor)
     if facts.pose is not None:
         parts["pose"] = {}
     return _Source(file, parts, facts.pose)
@@ -148,7 +152,8 @@ def _from_ours(file: Path, entries: Any) -> _Source:
     if not isinstance(entries, Mapping):
         raise CalibrationError(f"{file}: expected a mapping for the camera, got {entries!r}")
     part_of = dict.fromkeys((*POSES, "quaternion_xyzw"), "pose")
-    part_of |= {"height": "image size", "width": "image size", "depth_unit": "depth unit"}
+    part_of |= {"height": "image size", "width": "image size"}
+    part_of |= {"depth_unit": "depth unit", "depth_sensor": "depth sensor"}
     parts: dict[str, dict[str, Any]] = {}
     for key, value in entries.items():
         parts.setdefault(part_of.get(key, "intrinsics"), {})[key] = value

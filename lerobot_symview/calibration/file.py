@@ -22,19 +22,25 @@ The file is YAML or JSON:
         distortion: [0.09, -0.18, 0.0005, -0.0003, 0.06]      # k1, k2, p1, p2, k3, as OpenCV orders them; optional
         distortion_model: plumb_bob # or rational_polynomial, equidistant (fisheye); by default by the count, 4, 5 or 8
         depth_unit: mm              # m, mm, or metres per unit such as 0.0001; optional
+        depth_sensor:               # where depth is not aligned with colour; the size is that of the depth images
+          intrinsics: [385.2, 385.2, 320.1, 238.7]
+          color_from_depth:         # or position and quaternion_xyzw of the depth sensor in the colour camera's frame
+            - [1, 0, 0, 0.0148]
+            - [0, 1, 0, 0.0001]
+            - [0, 0, 1, 0.0003]
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
 from lerobot_symview.errors import CalibrationError, OptionError
-from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
+from lerobot_symview.geometry.camera import Array, Camera, DepthSensor, invert_rigid
 from lerobot_symview.geometry.lens import Lens, lens_from_coefficients
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
@@ -44,7 +50,8 @@ logger = logging.getLogger(__name__)
 METRES = {"m": 1.0, "mm": 0.001}
 REQUIRED = ("height", "width", "intrinsics")
 POSES = ("world_from_cam", "cam_from_world", "position")
-OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion", "distortion_model")
+OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion", "distortion_model", "depth_sensor")
+SENSOR_POSES = ("color_from_depth", "position")
 ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
 
 
@@ -130,6 +137,7 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
             "intrinsics": camera.intrinsics.tolist(),
             "world_from_cam": camera.world_from_cam.tolist(),
             **plain_lens(camera.lens),
+            **plain_depth_sensor(camera.depth_sensor),
             **({"depth_unit": calibration.depth_units[name]} if name in calibration.depth_units else {}),
         }
         for name, camera in calibration.cameras.items()
@@ -145,18 +153,18 @@ def plain_lens(lens: Lens | None) -> dict[str, Any]:
     return {} if lens is None else {"distortion": list(lens.coefficients), "distortion_model": lens.model}
 
 
+def plain_depth_sensor(sensor: DepthSensor | None) -> dict[str, Any]:
+    """Return the entries of a depth sensor in a camera's mapping; none where depth is aligned with colour."""
+    if sensor is None:
+        return {}
+    matrices = {"intrinsics": sensor.intrinsics, "color_from_depth": sensor.color_from_depth}
+    return {"depth_sensor": {name: matrix.tolist() for name, matrix in matrices.items()}}
+
+
 def _camera(name: str, entries: Any, metres: float) -> Camera:
     if not isinstance(entries, Mapping):
         raise CalibrationError(f"expected a mapping with {', '.join(REQUIRED)} and a pose, got {entries!r}")
-    problems = _unknown_keys("it", entries, (*REQUIRED, *POSES, *OPTIONAL))
-    missing = [entry for entry in REQUIRED if entry not in entries]
-    if missing:
-        problems.append(f"lacks {', '.join(missing)}")
-    poses = [pose for pose in POSES if pose in entries]
-    if len(poses) != 1:
-        problems.append(f"expected one of {', '.join(POSES)}, got {', '.join(poses) or 'none'}")
-    if ("position" in entries) != ("quaternion_xyzw" in entries):
-        problems.append("position and quaternion_xyzw belong together")
+    problems = _entry_problems(entries, REQUIRED, POSES, OPTIONAL)
     if problems:
         raise CalibrationError("; ".join(problems))
     for side in ("height", "width"):
@@ -164,7 +172,37 @@ def _camera(name: str, entries: Any, metres: float) -> Camera:
             raise CalibrationError(f"{side} must be a positive number of pixels, got {entries[side]!r}")
     intrinsics, world_from_cam = _intrinsics(entries["intrinsics"]), _pose(name, entries, metres)
     lens = _lens(entries.get("distortion"), entries.get("distortion_model"))
-    return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), entries["height"], entries["width"], lens)
+    sensor = _depth_sensor(name, entries.get("depth_sensor"), metres)
+    size = entries["height"], entries["width"]
+    return Camera(_as_float32(intrinsics), _as_float32(world_from_cam), *size, lens, sensor)
+
+
+def _entry_problems(
+    entries: Mapping[str, Any], required: Sequence[str], poses: Sequence[str], optional: Sequence[str]
+) -> list[str]:
+    """Return which entries are unknown or missing, or give the pose twice; empty if there are no such problems."""
+    problems = _unknown_keys("it", entries, (*required, *poses, *optional))
+    missing = [entry for entry in required if entry not in entries]
+    if missing:
+        problems.append(f"lacks {', '.join(missing)}")
+    given = [pose for pose in poses if pose in entries]
+    if len(given) != 1:
+        problems.append(f"expected one of {', '.join(poses)}, got {', '.join(given) or 'none'}")
+    if ("position" in entries) != ("quaternion_xyzw" in entries):
+        problems.append("position and quaternion_xyzw belong together")
+    return problems
+
+
+def _depth_sensor(name: str, entries: Any, metres: float) -> DepthSensor | None:
+    if entries is None:
+        return None
+    if not isinstance(entries, Mapping):
+        raise CalibrationError(f"depth_sensor must be a mapping with intrinsics and color_from_depth, got {entries!r}")
+    problems = _entry_problems(entries, ("intrinsics",), SENSOR_POSES, ("quaternion_xyzw",))
+    if problems:
+        raise CalibrationError("depth_sensor: " + "; ".join(problems))
+    color_from_depth = _pose(name, entries, metres)
+    return DepthSensor(_as_float32(_intrinsics(entries["intrinsics"])), _as_float32(color_from_depth))
 
 
 def _intrinsics(value: Any) -> Array:
@@ -189,7 +227,7 @@ def _lens(coefficients: Any, model: Any) -> Lens | None:
 
 
 def _pose(name: str, entries: Mapping[str, Any], metres: float) -> Array:
-    """Return world_from_cam (4, 4), metres."""
+    """Return world_from_cam or color_from_depth (4, 4), metres, whichever the entries give."""
     pose = np.eye(4)
     if "position" in entries:
         from scipy.spatial.transform import Rotation
@@ -201,12 +239,12 @@ def _pose(name: str, entries: Mapping[str, Any], metres: float) -> Array:
         pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         pose[:3, 3] = _numbers("position", entries["position"], (3,), "three numbers x, y, z") * metres
         return pose
-    key = "world_from_cam" if "world_from_cam" in entries else "cam_from_world"
+    key = next(key for key in ("world_from_cam", "cam_from_world", "color_from_depth") if key in entries)
     numbers = _numbers(key, entries[key], (12, 16), "4 (or the first 3) rows of 4 numbers")
     pose[: len(numbers) // 4] = numbers.reshape(-1, 4)
     pose[:3, 3] *= metres
     pose[:3, :3] = _nearest_rotation(f"camera {name!r}: {key}", pose[:3, :3])
-    return pose if key == "world_from_cam" else invert_rigid(pose)
+    return invert_rigid(pose) if key == "cam_from_world" else pose
 
 
 def _nearest_rotation(name: str, matrix: Array) -> Array:

@@ -195,7 +195,9 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         with flagged(f"--calibration={_listed(config.calibration)}"):
             camera = calibration.camera(config.camera)
             check_camera(config.camera, camera, workspace)
-        added |= calibration_features(config.camera, lens=camera.lens is not None)
+        added |= calibration_features(
+            config.camera, lens=camera.lens is not None, depth_sensor=camera.depth_sensor is not None
+        )
     for name, view in views.items():
         added |= view_features(config.camera, name, view, workspace)
     kept = config.kept_images()

@@ -103,7 +103,7 @@ def _unit_by_table(reader: FrameReader, key: str) -> float | None:
         return None
     index, depth = stored
     camera = _frame(replace(reader, views=()), 0, index).camera
-    unit = likely_depth_unit(depth, camera, reader.workspace)
+    unit = likely_depth_unit(depth, camera.depth_camera(*depth.shape), reader.workspace)
     if unit is not None:
         logger.info("%s declares no depth_unit: the table at z = 0 shows %s", key, unit_name(unit))
     return unit

@@ -26,6 +26,11 @@ LENS = (
     "distorted.\n"
 )
 
+DEPTH_SENSOR = (
+    "\nDepth is not aligned with colour: `depth_intrinsics` is the depth sensor's K, and `color_from_depth` maps its "
+    "coordinates to those of the colour camera, metres.\n"
+)
+
 
 def write_card(folder: Path, repo_id: str, tags: list[str]) -> None:
     """Write the card of the dataset in `folder`, and its image."""
@@ -135,7 +140,9 @@ def _calibration(dataset: SourceDataset) -> str:
         "`world_from_cam` (16 numbers, row-major), which maps camera coordinates (x right, y down, z forward, "
         "metres) to world coordinates (z up, table at z = 0). Integer pixel coordinates are pixel centres; depth is in "
         "metres along the optical axis, 0 where it is invalid. In top-down views, rows grow with the world's x and "
-        "columns with y.\n" + (LENS if any(key.endswith(".distortion") for key in known) else "")
+        "columns with y.\n"
+        + (LENS if any(key.endswith(".distortion") for key in known) else "")
+        + (DEPTH_SENSOR if any(key.endswith(".color_from_depth") for key in known) else "")
     )
 
 

@@ -210,6 +210,9 @@ def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
     numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
     if camera.lens is not None:
         numbers[keys.distortion] = camera.lens.stored()
+    if camera.depth_sensor is not None:
+        numbers[keys.depth_intrinsics] = camera.depth_sensor.intrinsics
+        numbers[keys.color_from_depth] = camera.depth_sensor.color_from_depth
     return {key(derivation.camera): values.astype(np.float32).ravel() for key, values in numbers.items()}
 
 

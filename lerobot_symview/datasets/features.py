@@ -48,20 +48,13 @@ def camera_features(
     return features | calibration_features(name)
 
 
-def calibration_features(name: str, *, lens: bool = False) -> Features:
-    """Declare the calibration of one camera, and optionally its lens."""
-    features: Features = {
-        keys.intrinsics(name): {
-            "dtype": "float32",
-            "shape": (9,),
-            "names": [f"k{i}{j}" for i in range(3) for j in range(3)],
-        },
-        keys.world_from_cam(name): {
-            "dtype": "float32",
-            "shape": (16,),
-            "names": [f"t{i}{j}" for i in range(4) for j in range(4)],
-        },
-    }
+def calibration_features(name: str, *, lens: bool = False, depth_sensor: bool = False) -> Features:
+    """Declare the calibration of one camera, and optionally its lens and its depth sensor."""
+    matrix = {"dtype": "float32", "shape": (9,), "names": [f"k{i}{j}" for i in range(3) for j in range(3)]}
+    pose = {"dtype": "float32", "shape": (16,), "names": [f"t{i}{j}" for i in range(4) for j in range(4)]}
+    features: Features = {keys.intrinsics(name): matrix, keys.world_from_cam(name): pose}
+    if depth_sensor:
+        features |= {keys.depth_intrinsics(name): dict(matrix), keys.color_from_depth(name): dict(pose)}
     if lens:
         # The model is a number of the column, and every model has as many, so that datasets with any lenses merge.
         names = ["model", *(f"d{index}" for index in range(1, STORED))]
@@ -110,7 +103,8 @@ def check_depth_size(camera: str, depth: Sequence[int], color: Sequence[int]) ->
     if tuple(depth[:2]) != tuple(color[:2]):
         raise DatasetError(
             f"{keys.depth(camera)} has {depth[0]} x {depth[1]} pixels, {keys.rgb(camera)} has {color[0]} x {color[1]}: "
-            "align depth to colour when recording, as rs.align(rs.stream.color) does for a RealSense"
+            "give the depth sensor's calibration, `depth_sensor` in the calibration file, or align depth to colour "
+            "when recording, as rs.align(rs.stream.color) does for a RealSense"
         )
 
 

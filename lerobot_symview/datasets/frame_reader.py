@@ -15,7 +15,7 @@ from lerobot_symview.calibration.file import Calibration
 from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature
 from lerobot_symview.datasets.source import SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
-from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, View
 
@@ -60,9 +60,14 @@ class FrameReader:
         return required
 
     def _calibration(self) -> list[str]:
-        """Return the keys of the stored calibration: intrinsics, pose, and distortion if the dataset has it."""
-        *needed, distortion = keys.calibration(self.camera)
-        return [*needed, distortion] if distortion in self.dataset.features else needed
+        """Return the keys of the stored calibration."""
+        return keys.calibration(self.camera, self.dataset.features)
+
+    def _has_depth_sensor(self) -> bool:
+        """Return whether depth has a calibration of its own, and thus a size and place of its own."""
+        if self.calibration is None:
+            return keys.depth_intrinsics(self.camera) in self._calibration()
+        return self.calibration.camera(self.camera).depth_sensor is not None
 
     def columns(self) -> list[str]:
         """Return the table columns that `frames` reads: its features except videos."""
@@ -76,7 +81,7 @@ class FrameReader:
         depth = keys.depth(self.camera)
         if self.depth and depth in features and not is_depth_feature(features[depth]):
             missing.append(f"{depth} as a depth feature")
-        if self.depth and depth not in missing and depth in features:
+        if self.depth and depth not in missing and depth in features and not self._has_depth_sensor():
             check_depth_size(self.camera, features[depth]["shape"], features[keys.rgb(self.camera)]["shape"])
         if missing:
             cameras = sorted(key.split(".")[2] for key in features if key.endswith(".intrinsics"))
@@ -99,19 +104,21 @@ class FrameReader:
             states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
         calibrations: Iterator[Any] = repeat(None)
         if self.calibration is None:
-            calibrations = zip(*(vectors(table, key) for key in self._calibration()), strict=True)
+            names = [keys.parameter(key) for key in self._calibration()]
+            columns = zip(*(vectors(table, key) for key in self._calibration()), strict=True)
+            calibrations = (dict(zip(names, numbers, strict=True)) for numbers in columns)
         steps = zip(colors, depths, states, calibrations, strict=False)
         for index, (rgb, depth, state, stored) in enumerate(islice(steps, len(table))):
             try:
                 camera = self._camera(stored, *rgb.shape[:2])
+                aligned = None if depth is None else aligned_depth(depth, camera)
             except CalibrationError as error:
                 raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
-            yield Frame(rgb, depth, camera, self.workspace, state)
+            yield Frame(rgb, aligned, camera, self.workspace, state)
 
-    def _camera(self, stored: tuple[NDArray, ...] | None, height: int, width: int) -> Camera:
+    def _camera(self, stored: dict[str, NDArray] | None, height: int, width: int) -> Camera:
         if stored is not None:
-            intrinsics, world_from_cam, *distortion = stored
-            return stored_camera(intrinsics, world_from_cam, height, width, *distortion)
+            return stored_camera(height=height, width=width, **stored)
         assert self.calibration is not None
         camera = self.calibration.camera(self.camera)
         if (camera.height, camera.width) != (height, width):

@@ -23,6 +23,40 @@ Array = NDArray[np.float64]
 Optics = tuple[Lens | None, float, float, float, float, int, int]
 
 BORDER_SAMPLES = 33  # per side of the image, where a lens is checked
+LONGEST_BASELINE = 0.5  # between colour and depth, metres: sensors have 0.01 to 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSensor:
+    """The depth camera of a colour camera whose depth images are not aligned with colour.
+
+    Args:
+        intrinsics: (3, 3) float64, its matrix K in pixels of the depth image, no skew, no lens.
+        color_from_depth: (4, 4) float64, rigid, maps its coordinates to those of the colour camera, metres.
+
+    Raises:
+        CalibrationError: if a matrix is invalid; one message lists all problems.
+    """
+
+    intrinsics: Array
+    color_from_depth: Array
+
+    def __post_init__(self) -> None:
+        for name in ("intrinsics", "color_from_depth"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        problems = calibration_problems(self.intrinsics, self.color_from_depth, None, "color_from_depth")
+        if not problems and (baseline := np.linalg.norm(self.color_from_depth[:3, 3])) > LONGEST_BASELINE:
+            problems = [f"color_from_depth has a translation of {baseline:g} m: is it in millimetres?"]
+        if problems:
+            raise CalibrationError("invalid depth sensor: " + "; ".join(problems))
+
+
+@lru_cache(maxsize=64)
+def _sensor_camera(sensor: DepthSensor, color: Camera, height: int, width: int) -> Camera:
+    try:
+        return Camera(sensor.intrinsics, color.world_from_cam @ sensor.color_from_depth, height, width)
+    except CalibrationError as error:
+        raise CalibrationError(f"the depth sensor does not fit its images: {error}") from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +69,7 @@ class Camera:
         height: image rows.
         width: image columns.
         lens: its distortion; None, or a lens that distorts nothing, for a pinhole camera.
+        depth_sensor: the camera of its depth images; None where these are aligned with colour.
 
     Raises:
         CalibrationError: if the matrices are invalid, or the lens does not show one ray in each pixel; one message
@@ -46,12 +81,13 @@ class Camera:
     height: int
     width: int
     lens: Lens | None = None
+    depth_sensor: DepthSensor | None = None
 
     def __post_init__(self) -> None:
         intrinsics = np.asarray(self.intrinsics, dtype=np.float64)
         world_from_cam = np.asarray(self.world_from_cam, dtype=np.float64)
         lens = None if self.lens is None or self.lens.is_pinhole else self.lens
-        problems = calibration_problems(intrinsics, world_from_cam, self.height, self.width)
+        problems = calibration_problems(intrinsics, world_from_cam, (self.height, self.width))
         if lens is not None and not problems:
             (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
             problems = _lens_problems(lens, fx, fy, cx, cy, self.height, self.width)
@@ -96,6 +132,14 @@ class Camera:
         """What the ideal pixels of its image depend on: lens, fx, fy, cx, cy, height and width."""
         return self.lens, self.fx, self.fy, self.cx, self.cy, self.height, self.width
 
+    def depth_camera(self, height: int, width: int) -> Camera:
+        """Return the camera of its depth images of a size: that of its depth sensor, or itself if it has none.
+
+        Raises:
+            CalibrationError: if the depth sensor does not fit the size.
+        """
+        return self if self.depth_sensor is None else _sensor_camera(self.depth_sensor, self, height, width)
+
     def resized(self, height: int, width: int | None = None) -> Camera:
         """Return the camera of the image after a change of its size; the field of view is the same.
 
@@ -108,11 +152,17 @@ class Camera:
         intrinsics = self.intrinsics.copy()
         intrinsics[:2] *= scale[:, None]
         intrinsics[:2, 2] += (scale - 1) / 2  # integer coordinates are pixel centres
-        return Camera(intrinsics, self.world_from_cam, height, width, self.lens)
+        return Camera(intrinsics, self.world_from_cam, height, width, self.lens, self.depth_sensor)
 
 
 def stored_camera(
-    intrinsics: NDArray, world_from_cam: NDArray, height: int, width: int, distortion: NDArray | None = None
+    intrinsics: NDArray,
+    world_from_cam: NDArray,
+    height: int,
+    width: int,
+    distortion: NDArray | None = None,
+    depth_intrinsics: NDArray | None = None,
+    color_from_depth: NDArray | None = None,
 ) -> Camera:
     """Return the camera with the matrices stored in a dataset or an observation.
 
@@ -122,6 +172,8 @@ def stored_camera(
         height: image rows.
         width: image columns.
         distortion: (9,), as `Lens.stored` returns; None for a pinhole camera.
+        depth_intrinsics: (9,) or (3, 3), K of the depth sensor; None where depth is aligned with colour.
+        color_from_depth: (16,) or (4, 4), its place, metres; None where depth is aligned with colour.
 
     Returns:
         The same object for equal arguments, so that results that depend on the camera alone can be cached.
@@ -129,23 +181,49 @@ def stored_camera(
     Raises:
         CalibrationError: if the matrices or the lens are invalid, as for `Camera`.
     """
-    matrices = (np.asarray(matrix, dtype=np.float64).tobytes() for matrix in (intrinsics, world_from_cam))
-    return _camera(*matrices, height, width, None if distortion is None else stored_lens(distortion))
+    matrices = [intrinsics, world_from_cam]
+    if depth_intrinsics is not None and color_from_depth is not None:
+        matrices += [depth_intrinsics, color_from_depth]
+    numbers = (np.asarray(matrix, dtype=np.float64).tobytes() for matrix in matrices)
+    return _camera(height, width, None if distortion is None else stored_lens(distortion), *numbers)
 
 
 @lru_cache(maxsize=256)
-def _camera(intrinsics: bytes, world_from_cam: bytes, height: int, width: int, lens: Lens | None) -> Camera:
-    k, pose = np.frombuffer(intrinsics).reshape(3, 3), np.frombuffer(world_from_cam).reshape(4, 4)
-    return Camera(k, pose, height, width, lens)
+def _camera(
+    height: int,
+    width: int,
+    lens: Lens | None,
+    intrinsics: bytes,
+    world_from_cam: bytes,
+    depth_intrinsics: bytes | None = None,
+    color_from_depth: bytes | None = None,
+) -> Camera:
+    sensor = None
+    if depth_intrinsics is not None and color_from_depth is not None:
+        sensor = DepthSensor(_matrix(depth_intrinsics, 3), _matrix(color_from_depth, 4))
+    return Camera(_matrix(intrinsics, 3), _matrix(world_from_cam, 4), height, width, lens, sensor)
 
 
-def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, width: int) -> list[str]:
-    """Return all problems of the matrices of a camera; empty if they are valid."""
+def _matrix(numbers: bytes, side: int) -> Array:
+    return np.frombuffer(numbers).reshape(side, side)
+
+
+def calibration_problems(
+    intrinsics: Array, pose: Array, size: tuple[int, int] | None, pose_name: str = "world_from_cam"
+) -> list[str]:
+    """Return all problems of the matrices of a camera; empty if they are valid.
+
+    Args:
+        intrinsics: (3, 3), K in pixels.
+        pose: (4, 4), rigid.
+        size: rows and columns of the image; None if they are unknown.
+        pose_name: name of the pose in the messages.
+    """
     if intrinsics.shape != (3, 3):
         return [f"intrinsics must have shape (3, 3), got {intrinsics.shape}"]
-    if world_from_cam.shape != (4, 4):
-        return [f"world_from_cam must have shape (4, 4), got {world_from_cam.shape}"]
-    if not (np.isfinite(intrinsics).all() and np.isfinite(world_from_cam).all()):
+    if pose.shape != (4, 4):
+        return [f"{pose_name} must have shape (4, 4), got {pose.shape}"]
+    if not (np.isfinite(intrinsics).all() and np.isfinite(pose).all()):
         return ["matrices must be finite"]
     problems = []
     (fx, skew, cx), (row_1, fy, cy), last = intrinsics
@@ -153,16 +231,16 @@ def calibration_problems(intrinsics: Array, world_from_cam: Array, height: int, 
         problems.append(f"focal lengths must be positive, got fx={fx:g}, fy={fy:g}")
     if skew != 0 or row_1 != 0 or not np.array_equal(last, [0, 0, 1]):
         problems.append("intrinsics must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    if not (0 <= cx <= width - 1 and 0 <= cy <= height - 1):
-        problems.append(f"principal point ({cx:g}, {cy:g}) lies outside the {width} x {height} image")
-    rotation = world_from_cam[:3, :3]
+    if size is not None and not (0 <= cx <= size[1] - 1 and 0 <= cy <= size[0] - 1):
+        problems.append(f"principal point ({cx:g}, {cy:g}) lies outside the {size[1]} x {size[0]} image")
+    rotation = pose[:3, :3]
     deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if deviation > 1e-4:
         problems.append(f"rotation is not orthonormal (largest deviation {deviation:.2g})")
     elif np.linalg.det(rotation) < 0:
         problems.append("rotation is a reflection (determinant -1): the axes are left-handed")
-    if not np.allclose(world_from_cam[3], [0, 0, 0, 1], atol=1e-6):
-        problems.append(f"last row of world_from_cam must be 0 0 0 1, got {world_from_cam[3]}")
+    if not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        problems.append(f"last row of {pose_name} must be 0 0 0 1, got {pose[3]}")
     return problems
 
 
@@ -230,6 +308,23 @@ def invert_rigid(a_from_b: Array) -> Array:
 def transform(a_from_b: Array, points_b: Array) -> Array:
     """Map points (..., 3) from frame b to frame a with a rigid (4, 4): R p + t; float64, both in metres."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
+
+
+def aligned_depth(depth: NDArray[np.floating], camera: Camera) -> NDArray[np.floating]:
+    """Return depth in the pixels of the colour camera: registered if it is of a sensor of its own, else unchanged.
+
+    Args:
+        depth: (h, w) float, metres along the optical axis of the sensor, or of the camera where it has no sensor.
+        camera: the colour camera.
+
+    Raises:
+        CalibrationError: if the depth sensor does not fit the image.
+    """
+    if camera.depth_sensor is None:
+        return depth
+    from lerobot_symview.geometry.registration import register_depth  # slow import: numba
+
+    return register_depth(depth, camera)
 
 
 def unproject(depth: NDArray[np.floating], camera: Camera) -> Array:

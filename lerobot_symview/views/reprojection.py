@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.errors import OptionError
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.camera import Camera, aligned_depth
 from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, gray_to_rgb
@@ -47,7 +47,7 @@ def reproject(
     Args:
         rgb: (H, W, 3) uint8.
         depth: (H, W) depth along the optical axis, float metres or integer millimetres; 0, negative or non-finite =
-            invalid.
+            invalid. With `camera.depth_sensor` it is the sensor's image, of any size, and is registered first.
         camera: calibrated camera of the images.
         workspace: the square on the table that the view shows.
         gripper: (5,) x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture in
@@ -71,7 +71,7 @@ def reproject(
     """
     view = ViewSpec("reproj", options | {"height": True, "mask": True}).make()
     gripper = None if gripper is None else np.asarray(gripper)
-    images = view.render(Frame(rgb, in_metres(depth), camera, workspace, gripper))
+    images = view.render(Frame(rgb, aligned_depth(in_metres(depth), camera), camera, workspace, gripper))
     return Reprojection(images["reproj"], images["reproj_height"], images["reproj_seen"][..., 0] > 0)
 
 

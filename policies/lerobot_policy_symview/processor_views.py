@@ -19,7 +19,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.datasets.features import check_depth_size, declared_unit
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import (
     METRES,
@@ -180,11 +180,12 @@ class ViewsProcessorStep(ObservationProcessorStep):
         color = observation.get(keys.rgb(self.camera))
         if self._missing_matrices(observation) or not depth.numel() or color is None:
             return None
-        if depth.shape[-2:] != color.shape[-2:]:
+        camera = self._cameras(observation, len(depth), *color.shape[-2:])[0]
+        if camera.depth_sensor is None and depth.shape[-2:] != color.shape[-2:]:
             return None  # `_batch` rejects it
         height, width = depth.shape[-2:]
-        camera = self._cameras(observation, len(depth), height, width)[0]
-        return likely_depth_unit(depth[0].reshape(height, width).cpu().numpy(), camera, self._workspace)
+        image = depth[0].reshape(height, width).cpu().numpy()
+        return likely_depth_unit(image, camera.depth_camera(height, width), self._workspace)
 
     def _check(self, batch: FrameBatch) -> None:
         """Raise a CalibrationError if the first frame contradicts the calibration."""
@@ -223,15 +224,21 @@ class ViewsProcessorStep(ObservationProcessorStep):
             rgb = (rgb * 255).round().to(torch.uint8)
         height, width = rgb.shape[2:]
         cameras = self._cameras(observation, len(rgb), height, width)
-        if needs_depth:
-            check_depth_size(self.camera, observation[depth].shape[-2:], (height, width))
         return FrameBatch(
             rgb,
-            observation[depth][:, 0] if needs_depth else None,
+            self._aligned(observation[depth][:, 0], cameras) if needs_depth else None,
             cameras,
             self._workspace,
             observation[keys.STATE].detach()[:, self.gripper] if uses_gripper else None,
         )
+
+    def _aligned(self, depth: Tensor, cameras: list[Camera]) -> Tensor:
+        """Return depth (B, H, W) in the pixels of the colour images; `depth` is that of the sensors, metres."""
+        if all(camera.depth_sensor is None for camera in cameras):
+            check_depth_size(self.camera, depth.shape[1:], (cameras[0].height, cameras[0].width))
+            return depth
+        images = [aligned_depth(image, camera) for image, camera in zip(depth.cpu().numpy(), cameras, strict=True)]
+        return torch.from_numpy(np.stack(images)).to(depth.device)
 
     def _missing_matrices(self, observation: RobotObservation) -> list[str]:
         """Return the calibration's keys that the observation lacks, where the step has no calibration of its own."""
@@ -245,11 +252,18 @@ class ViewsProcessorStep(ObservationProcessorStep):
     def _cameras(self, observation: RobotObservation, count: int, height: int, width: int) -> list[Camera]:
         """Return the camera of each of `count` frames: the observation's, else the step's own."""
         if all(key in observation for key in self._matrix_shapes):
-            shapes = dict(self._matrix_shapes)
-            if keys.distortion(self.camera) in observation:
-                shapes[keys.distortion(self.camera)] = (STORED,)
-            stored = (_numbers(key, observation[key], shape, count) for key, shape in shapes.items())
-            return [stored_camera(k, pose, height, width, *lens) for k, pose, *lens in zip(*stored, strict=True)]
+            shapes = self._matrix_shapes | {
+                keys.distortion(self.camera): (STORED,),
+                keys.depth_intrinsics(self.camera): (3, 3),
+                keys.color_from_depth(self.camera): (4, 4),
+            }
+            stored = keys.calibration(self.camera, observation)
+            names = [keys.parameter(key) for key in stored]
+            columns = (_numbers(key, observation[key], shapes[key], count) for key in stored)
+            return [
+                stored_camera(height=height, width=width, **dict(zip(names, numbers, strict=True)))
+                for numbers in zip(*columns, strict=True)
+            ]
         camera = self._fixed_camera
         assert camera is not None
         if (height, width) != (camera.height, camera.width):

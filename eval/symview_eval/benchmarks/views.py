@@ -23,7 +23,7 @@ from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_rgb, encode_rgb
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.camera import Camera, DepthSensor, aligned_depth
 from lerobot_symview.geometry.homography import image_from_topdown
 from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
 from lerobot_symview.geometry.placement import CameraSpec
@@ -37,6 +37,7 @@ from symview_sim.settings import EnvSettings, NewDataset
 BATCH = 64  # frames on a GPU
 NOISE = 2.0  # standard deviation in levels of 255: a webcam indoors
 WEBCAM = Lens(PLUMB_BOB, (-0.27, 0.05, 0.001, 0.0, 0.0))  # ordinary barrel distortion
+BASELINE = np.array([[1, 0, 0, 0.015], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # a RealSense's color_from_depth
 RECORDED = 25  # recorded episodes, repeated to fill the offline dataset
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
@@ -82,17 +83,19 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
 
     Returns:
         Medians, with the quartiles as `_low` and `_high`. `*_ratio`: a view's time over that of `cv2.warpPerspective`.
-        `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `vga_ms` and
-        `vga_lens_ms`: a 640 x 480 frame, without and with a lens, reprojected; `vga_lens_ratio`: the second over the
-        first, at most 2. `batched_*`, on a GPU: time per frame of a batch, without quartiles. `offline_codec_share`:
-        part of `symview-add-views` spent on reading, decoding, encoding and writing, for images with a real camera's
-        noise. `offline_two_process_speedup`: speed-up by a second process including its start-up, most of which falls
-        into the first round. `frames_per_s`: frames for which one process makes both views.
+        `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `vga_ms`,
+        `vga_lens_ms`, `vga_unaligned_ms` and `hd_ms`: a frame of 640 x 480 pixels reprojected, the same with a lens,
+        the same with depth from a sensor of its own, and a frame of 1280 x 720. `vga_lens_ratio` and
+        `vga_unaligned_ratio`: the second and third over the first, at most 2. `batched_*`, on a GPU: time per frame of
+        a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on reading, decoding,
+        encoding and writing, for images with a real camera's noise. `offline_two_process_speedup`: speed-up by a second
+        process including its start-up, most of which falls into the first round. `frames_per_s`: frames for which one
+        process makes both views.
     """
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        results = _ratios(simulated_frame(), config.repeats) | lens_times(config.repeats)
+        results = _ratios(simulated_frame(), config.repeats) | real_camera_times(config.repeats)
     finally:
         cv2.setNumThreads(threads)
     results |= _on_a_gpu(config.repeats)
@@ -189,21 +192,34 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
     return {"warp_us": 1e6 * statistics.median(warps)} | results
 
 
-def lens_times(repeats: int) -> dict[str, float]:
-    """Return the milliseconds of a reprojection of the table at 640 x 480 without and with a lens, and their ratio."""
+def real_camera_times(repeats: int) -> dict[str, float]:
+    """Return the milliseconds of reprojections of the table from images of real cameras, and ratios to `vga_ms`."""
     view, workspace = make_view("reproj", clip="none"), Workspace()
-    placed = CameraSpec(height=480, width=640).place(workspace)
-    frames = [_table_frame(replace(placed, lens=lens), workspace) for lens in (None, WEBCAM)]
-    for frame in frames:
-        view.render(frame)
-    pairs = [[1000 * seconds(partial(view.render, frame)) for frame in frames] for _ in range(repeats)]
-    plain, through_lens = zip(*pairs, strict=True)
-    ratios = [distorted / pinhole for pinhole, distorted in pairs]
-    return (
-        _median_and_quartiles("vga_ms", list(plain))
-        | _median_and_quartiles("vga_lens_ms", list(through_lens))
-        | _median_and_quartiles("vga_lens_ratio", ratios)
-    )
+    vga, hd = (CameraSpec(height=rows, width=columns).place(workspace) for rows, columns in ((480, 640), (720, 1280)))
+    frames = {
+        "vga": _table_frame(vga, workspace),
+        "vga_lens": _table_frame(replace(vga, lens=WEBCAM), workspace),
+        "hd": _table_frame(hd, workspace),
+    }
+    sensor = DepthSensor(vga.intrinsics * [[0.8], [0.8], [1]] + [[0, 0, 64], [0, 0, 48], [0, 0, 0]], BASELINE)
+    unaligned = replace(vga, depth_sensor=sensor)
+    _, depth, _ = table_rays(unaligned.depth_camera(480, 640), workspace)
+    depth, rgb = depth.astype(np.float32), frames["vga"].rgb
+
+    def render_unaligned() -> object:
+        return view.render(Frame(rgb, aligned_depth(depth, unaligned), unaligned, workspace))
+
+    calls: dict[str, Callable[[], object]] = {name: partial(view.render, frame) for name, frame in frames.items()}
+    calls["vga_unaligned"] = render_unaligned
+    for call in calls.values():
+        call()
+    rounds = [{name: 1000 * seconds(call) for name, call in calls.items()} for _ in range(repeats)]
+    results: dict[str, float] = {}
+    for name in calls:
+        results |= _median_and_quartiles(f"{name}_ms", [times[name] for times in rounds])
+    for name in ("vga_lens", "vga_unaligned"):
+        results |= _median_and_quartiles(f"{name}_ratio", [times[name] / times["vga"] for times in rounds])
+    return results
 
 
 def _table_frame(camera: Camera, workspace: Workspace) -> Frame:

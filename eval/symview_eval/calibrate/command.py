@@ -6,6 +6,8 @@ import logging
 import sys
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from lerobot_symview.calibration.board import Board
 from lerobot_symview.calibration.board_print import board_print, encode_print
 from lerobot_symview.calibration.convert import convert
@@ -15,6 +17,7 @@ from lerobot_symview.calibration.table_plane import levelled, likely_depth_unit
 from lerobot_symview.calibration.writers import WRITERS
 from lerobot_symview.datasets.add_views import POSE_FLAGS, pose_flagged
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera, aligned_depth
 from lerobot_symview.geometry.units import in_metres, parse_unit, unit_name
 from lerobot_symview.geometry.visibility import camera_problem, check_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -114,23 +117,28 @@ def _levelled(config: CalibrateConfig, result: Result, workspace: Workspace) -> 
     if config.depth is not None:
         with flagged("--depth"):
             stored = depth_from_file(config.depth)
-        if stored.shape == (result.camera.height, result.camera.width):
-            unit = unit or likely_depth_unit(stored, result.camera, workspace)
+        if unit is None and _fits(stored, result.camera):
+            unit = likely_depth_unit(stored, result.camera.depth_camera(*stored.shape), workspace)
         depth = in_metres(stored, unit)
     else:
         assert config.dataset is not None
         with flagged("--dataset, --camera, --episodes"):
             depth = depth_from_dataset(config.dataset.folder(), config.camera, config.episodes[0], unit)
-    if depth.shape != (result.camera.height, result.camera.width):
+    if not _fits(depth, result.camera):
         raise CalibrationError(
-            f"--refine=table: depth has {depth.shape[1]} x {depth.shape[0]} pixels, the camera "
-            f"{result.camera.width} x {result.camera.height}: align it to colour"
+            f"--refine=table: depth has {depth.shape[1]} x {depth.shape[0]} pixels, the camera {result.camera.width} x "
+            f"{result.camera.height}: align it to colour, or give `depth_sensor` in the file of --intrinsics"
         )
     with flagged("--refine=table"):
-        camera, plane = levelled(depth, result.camera, workspace)
+        camera, plane = levelled(aligned_depth(depth, result.camera), result.camera, workspace)
     read = "" if unit is None else f" (depth in {unit_name(unit)})"
     logger.info("in the depth image%s %s, before the correction; now at z = 0", read, plane)
     return Result(camera, result.rgb, result.corners, f"{plane}: corrected")
+
+
+def _fits(depth: NDArray, camera: Camera) -> bool:
+    """Whether a depth image has the size of its camera, or is that of a depth sensor, which may have any size."""
+    return camera.depth_sensor is not None or depth.shape == (camera.height, camera.width)
 
 
 def main() -> None:

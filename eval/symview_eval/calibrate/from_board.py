@@ -75,7 +75,8 @@ def from_board(config: CalibrateConfig) -> Result:
     with flagged(f"{pose_image}, --board, --intrinsics"):
         pose = board_pose(corners, intrinsics, width)
         lens = lens_from_coefficients(None, intrinsics.distortion)
-        camera = Camera(intrinsics.matrix, world_from_cam(pose, config.board.world_from_board), height, width, lens)
+        world_from_camera = world_from_cam(pose, config.board.world_from_board)
+        camera = Camera(intrinsics.matrix, world_from_camera, height, width, lens, intrinsics.depth_sensor)
     caption = f"{len(corners)} corners, reprojection error {pose.error_px:.2f} px, {pose.error_mm:.2f} mm on the table"
     logger.info(
         "%s: %s; board's orientation ± %.2f°, distance ± %.1f mm",
@@ -121,13 +122,13 @@ def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intri
                 f"these have {width} x {height}"
             ) from None
         if camera.lens is None:
-            return Intrinsics(camera.intrinsics)
+            return Intrinsics(camera.intrinsics, depth_sensor=camera.depth_sensor)
         if camera.lens.model == EQUIDISTANT:
             raise CalibrationError(
                 f"--intrinsics: camera {name!r} has an {EQUIDISTANT} lens, with which no pose is found from a board: "
                 "undistort the images, or estimate the intrinsics from them"
             ) from None
-        return Intrinsics(camera.intrinsics, np.array(camera.lens.coefficients))
+        return Intrinsics(camera.intrinsics, np.array(camera.lens.coefficients), camera.depth_sensor)
     return Intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration, plain_lens
+from lerobot_symview.calibration.file import (
+    Calibration,
+    parse_calibration,
+    plain_calibration,
+    plain_depth_sensor,
+    plain_lens,
+)
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -49,6 +55,7 @@ def write_result(config: CalibrateConfig, known: Calibration, workspace: Workspa
         "intrinsics": np.round([camera.fx, camera.fy, camera.cx, camera.cy], 4).tolist(),
         "world_from_cam": camera.world_from_cam.round(7).tolist(),
         **plain_lens(camera.lens),
+        **plain_depth_sensor(camera.depth_sensor),
     }
     if camera.lens is not None:
         entry["distortion"] = np.round(camera.lens.coefficients, 8).tolist()

@@ -52,6 +52,7 @@ class CameraFacts:
         pose: relative to the robot's base or the world.
         depth_unit: metres per unit of depth.
         color_from_depth: (4, 4), metres, of a depth camera beside the colour camera.
+        depth_intrinsics: (3, 3), K of that depth camera.
     """
 
     intrinsics: Array | None = None
@@ -61,6 +62,7 @@ class CameraFacts:
     pose: Pose | None = None
     depth_unit: float | None = None
     color_from_depth: Array | None = None
+    depth_intrinsics: Array | None = None
 
 
 Facts = dict[str, CameraFacts]

@@ -73,7 +73,7 @@ def _orbbec(document: Document, size: Size | None) -> Facts:
     """A block for each image size; depth_to_color in millimetres."""
     shape, block = choose_size(_blocks(_color(document)), size)
     values = block.get("intrinsic", block.get("intrinsics", block))
-    center = [values.get(f"c{axis}", values.get(f"pp{axis}")) for axis in "xy"]
+    center = _center(values)
     distortion = block.get("distortion") or {}
     if isinstance(distortion, Mapping):
         distortion = [distortion.get(name, 0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
@@ -87,8 +87,22 @@ def _orbbec(document: Document, size: Size | None) -> Facts:
             shape,
             **lens(None, coefficients),
             color_from_depth=None if extrinsic is None else _color_from_depth(extrinsic),
+            depth_intrinsics=_only_intrinsics(document.entries().get("depth")),
         )
     }
+
+
+def _only_intrinsics(entries: Any) -> Array | None:
+    """Return K of a depth camera; None if the file has none, or several sizes, of which depth images may have any."""
+    blocks = list(_blocks(entries).values()) if isinstance(entries, Mapping) else []
+    if len(blocks) != 1:
+        return None
+    values = blocks[0].get("intrinsic", blocks[0].get("intrinsics", blocks[0]))
+    return pinhole(*(values.get(f"f{axis}") for axis in "xy"), *_center(values))
+
+
+def _center(values: Mapping[str, Any]) -> list[Any]:
+    return [values.get(f"c{axis}", values.get(f"pp{axis}")) for axis in "xy"]
 
 
 def _color_from_depth(entries: Mapping[str, Any]) -> Array:

@@ -132,17 +132,16 @@ def read_calibration(config: SymviewConfig) -> None:
 def _fixed_camera(meta: Any, name: str) -> Camera | None:
     """Return the camera whose calibration is the same in all frames; None if there is none of known image size."""
     # The statistics of the columns tell: LeRobot's tools keep them in every dataset that they write.
-    *columns, distortion = keys.calibration(name)
-    columns += [distortion] if distortion in meta.features else []
+    columns = keys.calibration(name, meta.features)
     stats = meta.stats or {}
     if not all(key in stats and np.array_equal(stats[key]["min"], stats[key]["max"]) for key in columns):
         return None
     size = _image_size(meta, name)
     if size is None:
         return None
-    intrinsics, world_from_cam, *lens = (stats[key]["min"] for key in columns)
+    stored = {keys.parameter(key): stats[key]["min"] for key in columns}
     try:
-        return stored_camera(intrinsics, world_from_cam, *size, *lens)
+        return stored_camera(height=size[0], width=size[1], **stored)
     except CalibrationError as error:
         raise CalibrationError(f"the dataset's calibration of camera {name!r}: {error}") from None
 

@@ -114,7 +114,7 @@ class SceneInput(ABC):
 
     def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """K (B, 9) and pose (B, 16) of the camera: the observation's, or the configuration's where it has none."""
-        intrinsics, world_from_cam, _ = keys.calibration(self.config.camera)
+        intrinsics, world_from_cam = keys.calibration(self.config.camera, ())
         if self._has_calibration(batch):
             return batch[intrinsics], batch[world_from_cam]
         assert self._fixed_camera is not None  # `own_names` has checked it
@@ -126,8 +126,7 @@ class SceneInput(ABC):
         return k, pose
 
     def _has_calibration(self, batch: dict[str, Tensor]) -> bool:
-        *needed, _ = keys.calibration(self.config.camera)
-        return all(key in batch for key in needed)
+        return all(key in batch for key in keys.calibration(self.config.camera, ()))
 
     def _lenses(self, batch: dict[str, Tensor], size: tuple[int, ...]) -> list[Camera] | None:
         """Cameras of the samples, or the one of all, if they have a lens; `size` are rows and columns of their images.
@@ -136,7 +135,7 @@ class SceneInput(ABC):
             CalibrationError: if a camera is invalid.
             ValueError: if the operations are recorded, which cannot depend on the observation's lens.
         """
-        intrinsics, _, distortion = keys.calibration(self.config.camera)
+        intrinsics, distortion = keys.intrinsics(self.config.camera), keys.distortion(self.config.camera)
         if self._has_calibration(batch):
             if distortion not in batch:
                 return None

@@ -14,7 +14,7 @@ import yaml
 from lerobot.datasets import LeRobotDataset, modify_features
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
-from lerobot_symview import keys
+from lerobot_symview import keys, reproject
 from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
@@ -236,3 +236,96 @@ def test_the_workspace_flag_overrides_the_file_and_the_dataset(recorded, tmp_pat
     np.testing.assert_array_equal(made["flag"], made["flag_before_file"])
     for name in ("dataset", "file"):
         assert (made[name] != made["flag"]).any()
+
+
+DEPTH_SENSOR = {
+    "intrinsics": [70.0, 70.0, 47.5, 35.5],
+    "color_from_depth": [[1, 0, 0, 15.0], [0, 1, 0, -4.0], [0, 0, 1, 2.0]],
+}
+
+
+def unaligned(tmp_path):
+    """Record an RGBD camera whose depth has another size and place; return folder, calibration file, and images."""
+    color = CameraSpec(height=120, width=160).place(Workspace())
+    rgb = np.random.default_rng(0).integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    pose = color.world_from_cam.copy()
+    pose[:3, 3] *= 1000
+    front = {"height": 120, "width": 160, "intrinsics": color.intrinsics.tolist(), "world_from_cam": pose.tolist()}
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump({"units": "mm", "cameras": {"front": front | {"depth_sensor": DEPTH_SENSOR}}}))
+    camera = read_calibration(file).camera("front")
+    depth = in_mm(plane_depth(camera.depth_camera(72, 96), 0.0))
+    record_real_robot(tmp_path / "robot", rgb, depth, depth_unit="mm")
+    return tmp_path / "robot", file, camera, rgb, depth
+
+
+def test_depth_of_a_sensor_of_its_own_is_registered_offline_and_online(tmp_path):
+    folder, file, camera, rgb, depth = unaligned(tmp_path)
+    assert camera.depth_sensor.color_from_depth[:3, 3] == pytest.approx([0.015, -0.004, 0.002])
+    options = {"camera": "front", "views": ["reproj"], "size": 64}
+    result = add_views(views_config(folder, tmp_path / "views", calibration=file, **options))
+    expected = reproject(rgb, depth, camera, Workspace(), size=64)
+    dataset = LeRobotDataset("test/views", root=result, depth_output_unit="m")
+    shown = (dataset[0][keys.view("front", "reproj")] * 255).round().byte().permute(1, 2, 0).numpy()
+    np.testing.assert_array_equal(shown, expected.rgb)
+    assert dataset[0][keys.depth_intrinsics("front")].tolist() == pytest.approx([70, 0, 47.5, 0, 70, 35.5, 0, 0, 1])
+    item = dataset[0]
+    for calibration in (plain_calibration(read_calibration(file)), {}):  # from the step, and from the observation
+        needed = [keys.rgb("front"), keys.depth("front"), keys.STATE]
+        needed += [] if calibration else keys.calibration("front", item)
+        step = ViewsProcessorStep(
+            [{"name": "reproj", "size": 64}], "front", calibration=calibration, gripper=[],
+            depth_units={keys.depth("front"): "m"},
+        )  # fmt: skip
+        online = step.observation({key: item[key][None] for key in needed})[keys.view("front", "reproj")]
+        np.testing.assert_array_equal((online[0] * 255).round().byte().permute(1, 2, 0).numpy(), expected.rgb)
+    masked = options | {"views": [{"name": "persp", "size": 64}, {"name": "reproj", "size": 64}]}
+    removed = [keys.view("front", output) for output in ("reproj", "reproj_height")]
+    modify_features(dataset, remove_features=removed, output_dir=tmp_path / "columns", repo_id="test/columns")
+    again = add_views(views_config(tmp_path / "columns", tmp_path / "again", new_repo_id="test/again", **masked))
+    np.testing.assert_array_equal(
+        images_of(again, keys.view("front", "reproj")), images_of(result, keys.view("front", "reproj"))
+    )
+
+
+def test_the_unit_of_a_depth_sensor_is_told_by_the_table(tmp_path):
+    """The sensor's own pose shows the table at z = 0 in the right unit only."""
+    _, file, camera, rgb, depth = unaligned(tmp_path)
+    step = ViewsProcessorStep(
+        [{"name": "reproj", "size": 64}], "front", calibration=plain_calibration(read_calibration(file)), gripper=[]
+    )
+    tenths = torch.from_numpy((depth * 10.0).astype(np.float32))[None, None]  # of a millimetre
+    color = torch.from_numpy(rgb).permute(2, 0, 1)[None]
+    view = step.observation({keys.rgb("front"): color, keys.depth("front"): tenths})[keys.view("front", "reproj")]
+    expected = reproject(rgb, depth, camera, Workspace(), size=64).rgb
+    shown = (view[0] * 255).round().byte().permute(1, 2, 0).numpy()
+    assert (shown == expected).all(axis=-1).mean() > 0.99  # metres round differently
+
+
+def test_depth_of_another_size_without_a_sensor_names_the_remedy(tmp_path):
+    folder, file, *_ = unaligned(tmp_path)
+    content = yaml.safe_load(file.read_text())
+    del content["cameras"]["front"]["depth_sensor"]
+    file.write_text(yaml.safe_dump(content))
+    config = views_config(folder, tmp_path / "never", calibration=file, camera="front", views=["reproj"])
+    with pytest.raises(DatasetError, match=r"72 x 96 pixels, .* 120 x 160: give the depth sensor's calibration"):
+        add_views(config)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "message"),
+    [
+        ({"intrinsics": [70, 70, 47.5, 35.5]}, "depth_sensor: expected one of color_from_depth, position, got none"),
+        (DEPTH_SENSOR | {"size": 3}, "depth_sensor: it has unknown keys: size"),
+        ([1, 2], "depth_sensor must be a mapping"),
+        (
+            DEPTH_SENSOR | {"color_from_depth": np.diag([1.0, 1, 1, 1]).tolist(), "intrinsics": [70, 70]},
+            "intrinsics must be",
+        ),
+    ],
+)
+def test_a_wrong_depth_sensor_in_a_file_is_refused(sensor, message):
+    front = {"height": 120, "width": 160, "intrinsics": [150.0, 150, 79.5, 59.5]}
+    front["world_from_cam"] = CameraSpec().place(Workspace()).world_from_cam.tolist()
+    with pytest.raises(CalibrationError, match=message):
+        parse_calibration({"units": "m", "cameras": {"front": front | {"depth_sensor": sensor}}})
