@@ -45,6 +45,7 @@ def read_features(config: SymviewConfig, features: Features) -> None:
             "for the view of another camera, give its name by --policy.camera"
         )
     _check_size(config, features)
+    _check_alignment(config, features)
     visuals = list(config.raw_keys)
     if not has_raw:
         visuals += [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
@@ -174,6 +175,20 @@ def _check_size(config: SymviewConfig, features: Features) -> None:
         raise ValueError(
             f"--policy.crop_size={config.crop_size} is larger than the {size} px of the shorter side of "
             f"{config.color_key!r}: lower it or make larger views"
+        )
+
+
+def _check_alignment(config: SymviewConfig, features: Features) -> None:
+    key = keys.depth(config.seen_camera)
+    if key not in config.raw_keys or config.is_computed or key not in features:
+        return  # views register depth
+    sensor = keys.depth_intrinsics(config.seen_camera)
+    size, color_size = (image_size(features, name) for name in (key, config.color_key))
+    if sensor in features or size != color_size:
+        reason = f"the dataset has {sensor}" if sensor in features else f"it has {size} pixels, colour {color_size}"
+        raise ValueError(
+            f"--policy.method={config.method} reads {key}, which is not aligned with colour, since {reason}: choose a "
+            "method with a view, such as reproj_equi, or align depth when recording"
         )
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_policy_symview.inputs.feature_contract import read_calibration
+from lerobot_policy_symview.inputs.feature_contract import read_calibration, read_features
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
@@ -66,3 +66,16 @@ def test_an_invalid_calibration_is_an_error_where_it_is_used(tmp_path):
     with pytest.raises(CalibrationError, match="the dataset's calibration of camera 'side'"):
         calibration_of(meta)
     assert calibration_of(meta, method="sideview_equi") == {}
+
+
+@pytest.mark.parametrize("method", ["sideview_equi", "point_cloud_equi", "voxel_equi"])
+@pytest.mark.parametrize("has_sensor", [True, False], ids=["with a sensor's calibration", "of another size"])
+def test_methods_that_read_raw_depth_refuse_depth_that_is_not_aligned(method, has_sensor):
+    vectors = {"dtype": "float32", "shape": (5,)}
+    depth = {"dtype": "image", "shape": (76, 76, 1) if has_sensor else (60, 76, 1), "info": {"is_depth_map": True}}
+    features = {keys.rgb("side"): {"dtype": "image", "shape": (76, 76, 3)}, keys.depth("side"): depth}
+    features |= {keys.STATE: vectors | {"names": keys.STATE_NAMES}, keys.ACTION: vectors | {"names": keys.ACTION_NAMES}}
+    features |= {key: {"dtype": "float32", "shape": (9,)} for key in [keys.depth_intrinsics("side")] if has_sensor}
+    reason = "the dataset has" if has_sensor else "it has"
+    with pytest.raises(ValueError, match=f"--policy.method={method} reads .*not aligned with colour, since {reason}"):
+        read_features(make_config(method=method), features)
