@@ -33,9 +33,9 @@ class DemoConfig:
     """Folder for all files; a second run continues an interrupted one."""
     demonstrations: int = 20
     """Expert episodes to record and train on."""
-    steps: int = 1200
+    steps: int = 2400
     """Training steps."""
-    batch_size: int = 16
+    batch_size: int = 8
     """Frames per training step."""
     eval_episodes: int = 50
     """Evaluation episodes."""
@@ -97,6 +97,7 @@ def train_command(config: DemoConfig, repo_id: str, dataset: Path, output: Path,
         "--policy.crop_size=64",
         "--policy.learning_rate_decay=cosine",
         "--policy.weight_averaging=0.99",
+        "--policy.aperture_noise=0.03",
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
         f"--steps={config.steps}",
