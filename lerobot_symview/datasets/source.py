@@ -22,7 +22,7 @@ from lerobot_symview.datasets.features import Features, declared_unit, is_depth_
 from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb, encoded_size
 from lerobot_symview.datasets.metadata import is_count, pixels, read_info
 from lerobot_symview.errors import DatasetError
-from lerobot_symview.geometry.units import METRES, MILLIMETRES, in_metres, infer_depth_unit, unit_name
+from lerobot_symview.geometry.units import ABOVE_MINIMUM, METRES, MILLIMETRES, in_metres, infer_depth_unit, unit_name
 
 logger = logging.getLogger(__name__)
 
@@ -229,7 +229,9 @@ class SourceDataset:
                 images = dequantize_depth(
                     images, coding.depth_min, coding.depth_max, coding.shift, coding.use_log, output_unit="m"
                 )
-                yield from images[:, 0].numpy().astype(np.float32)
+                depths = images[:, 0].numpy().astype(np.float32)
+                # The codes start at depth_min: an invalid 0 was clipped to it.
+                yield from np.where(depths > np.float32(coding.depth_min) * ABOVE_MINIMUM, depths, np.float32(0))
             else:
                 yield from images.permute(0, 2, 3, 1).contiguous().numpy()
 

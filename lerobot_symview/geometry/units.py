@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 METRES, MILLIMETRES = 1.0, 0.001
 UNIT_NAMES = {"m": METRES, "mm": MILLIMETRES}
+VIDEO_MINIMUM = 0.01  # metres, LeRobot's default `depth_min`: the depth that its depth videos show for invalid pixels
+ABOVE_MINIMUM = 1.01  # times the minimum: above rounding, and below the next code of a depth video
 METRES_AT_MOST = 10.0  # table scenes have no larger value in metres, and cameras measure no depth below 10 mm
 
 
@@ -63,7 +65,8 @@ def infer_depth_unit(depth: Any) -> float:
     """Return the most likely unit of depth images whose feature declares none, from their values alone.
 
     Integers are millimetres. Floats are millimetres if most valid pixels exceed 10: a camera over a table measures no
-    depth below 10 mm and few beyond 10 m. The majority decides, so that outliers do not matter.
+    depth below 10 mm and few beyond 10 m. The majority decides, so that outliers do not matter. Exactly 10 mm, with
+    which depth videos show invalid pixels, does not count.
 
     Args:
         depth: any shape, NumPy array or torch tensor; 0, negative or non-finite = invalid.
@@ -72,6 +75,8 @@ def infer_depth_unit(depth: Any) -> float:
     if not xp.isdtype(depth.dtype, "real floating"):
         return MILLIMETRES
     valid = xp.isfinite(depth) & (depth > 0)
+    for minimum in (VIDEO_MINIMUM, VIDEO_MINIMUM / MILLIMETRES):
+        valid = valid & (xp.abs(depth - minimum) > minimum * (ABOVE_MINIMUM - 1))
     large = valid & (depth > METRES_AT_MOST)
     return MILLIMETRES if bool(2 * xp.sum(large) > xp.sum(valid)) else METRES
 

@@ -96,8 +96,9 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
 
 def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
     assert batch.depth is not None
+    depth = without_flying_pixels_batch(batch.depth, view.flying_limit) if view.flying_limit else batch.depth
     height, source = zbuffer_batch(
-        batch.depth, batch.cameras, batch.workspace, view.size, [view.ceiling(z) for z in _gripper_heights(batch)]
+        depth, batch.cameras, batch.workspace, view.size, [view.ceiling(z) for z in _gripper_heights(batch)]
     )
     seen = source != EMPTY
     if view.infill == "nearest":
@@ -112,6 +113,22 @@ def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
         "reproj_height": height,
         "reproj_seen": (seen.to(torch.uint8) * 255)[:, None].expand(-1, 3, -1, -1),
     }
+
+
+def without_flying_pixels_batch(depth: Tensor, limit: float) -> Tensor:
+    """Return depth (B, H, W) with 0 at flying pixels, as `without_flying_pixels` does."""
+    flying = torch.zeros_like(depth, dtype=torch.bool)
+    valid = (depth > 0) & (depth < torch.inf)
+    for axis in (1, 2):
+        inner = depth.shape[axis] - 2
+        if inner < 1:
+            continue
+        before, here, after = (depth.narrow(axis, start, inner).double() for start in (0, 1, 2))
+        known = valid.narrow(axis, 0, inner) & valid.narrow(axis, 2, inner)
+        rising = (here - before > limit) & (after - here > limit)
+        falling = (before - here > limit) & (here - after > limit)
+        flying.narrow(axis, 1, inner).logical_or_(known & (rising | falling))
+    return torch.where(flying, torch.zeros_like(depth), depth)
 
 
 def zbuffer_batch(

@@ -22,8 +22,10 @@ from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import (
+    ABOVE_MINIMUM,
     METRES,
     MILLIMETRES,
+    VIDEO_MINIMUM,
     infer_depth_unit,
     infer_height_unit,
     parse_unit,
@@ -158,6 +160,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
             return observation
         self._read_units = {key: self._unit(key, values, observation) for key, values in images.items()}
         converted = {key: _metres(values, self._read_units[key]) for key, values in images.items()}
+        converted |= {key: _without_minimum(depth) for key, depth in converted.items() if key.endswith("_depth")}
         return {**observation, **converted, IN_METRES: torch.ones(())}
 
     def _unit(self, key: str, values: Tensor, observation: RobotObservation) -> float:
@@ -300,6 +303,11 @@ def _metres(depth: Tensor, unit: float) -> Tensor:
     depth = depth if depth.is_floating_point() else depth.float()
     # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which rounds differently.
     return depth if unit == METRES else depth / depth.new_full((), units_per_metre(unit))
+
+
+def _without_minimum(depth: Tensor) -> Tensor:
+    """Return depth in metres with 0 for the pixels that LeRobot's depth videos clip to their minimum."""
+    return torch.where(depth > VIDEO_MINIMUM * ABOVE_MINIMUM, depth, torch.zeros_like(depth))
 
 
 def _numbers(key: str, numbers: Tensor, shape: tuple[int, ...], count: int) -> NDArray[np.floating]:

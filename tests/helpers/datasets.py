@@ -53,7 +53,7 @@ def in_mm(depth, unit=0.001):
     return np.rint(depth / unit).astype(np.uint16)
 
 
-def record_real_robot(folder, rgb, depth, use_videos=False, episodes=1, **depth_info):
+def record_real_robot(folder, rgb, depth, use_videos=False, episodes=1, depth_video=False, **depth_info):
     """Record episodes of three frames of a robot with joint angles and an RGBD camera `front` without calibration."""
     joints = {"dtype": "float32", "shape": (6,), "names": [f"joint_{i}" for i in range(6)]}
     axes = ["height", "width", "channels"]
@@ -61,13 +61,13 @@ def record_real_robot(folder, rgb, depth, use_videos=False, episodes=1, **depth_
         "test/real",
         fps=10,
         root=folder,
-        use_videos=use_videos,
+        use_videos=use_videos or depth_video,
         features={
             keys.STATE: joints,
             keys.ACTION: joints,
             keys.rgb("front"): {"dtype": "video" if use_videos else "image", "shape": rgb.shape, "names": axes},
             keys.depth("front"): {
-                "dtype": "image",
+                "dtype": "video" if depth_video else "image",
                 "shape": (*depth.shape, 1),
                 "names": axes,
                 "info": {"is_depth_map": True} | depth_info,

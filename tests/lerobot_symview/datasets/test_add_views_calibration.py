@@ -329,3 +329,34 @@ def test_a_wrong_depth_sensor_in_a_file_is_refused(sensor, message):
     front["world_from_cam"] = CameraSpec().place(Workspace()).world_from_cam.tolist()
     with pytest.raises(CalibrationError, match=message):
         parse_calibration({"units": "m", "cameras": {"front": front | {"depth_sensor": sensor}}})
+
+
+@pytest.mark.parametrize("depth_video", [False, True], ids=["images", "video"])
+def test_pixels_without_depth_become_no_points(tmp_path, depth_video):
+    """LeRobot's depth videos clip an invalid 0 to their minimum, 1 cm: a point at the camera, above everything."""
+    camera = CameraSpec(elevation_deg=89.0, height=96, width=96).place(Workspace())
+    depth = in_mm(plane_depth(camera, 0.02))
+    depth[:, 48:] = 0
+    record_real_robot(
+        tmp_path / "robot", np.full((96, 96, 3), 90, np.uint8), depth, depth_video=depth_video, depth_unit="mm"
+    )
+    front = {"height": 96, "width": 96, "intrinsics": camera.intrinsics, "world_from_cam": camera.world_from_cam}
+    file = tmp_path / "cameras.yaml"
+    numbers = {key: np.asarray(value).tolist() for key, value in front.items()}
+    file.write_text(yaml.safe_dump({"units": "m", "cameras": {"front": numbers}}))
+    view = {"name": "reproj", "size": 48, "clip": "none", "infill": "none", "mask": True}
+    result = add_views(
+        views_config(tmp_path / "robot", tmp_path / "views", calibration=file, camera="front", views=[view])
+    )
+    heights = images_of(result, keys.view("front", "reproj_height"))
+    seen = images_of(result, keys.view("front", "reproj_seen"))[:, :1] > 0
+    assert 0.2 < seen.mean() < 0.6
+    assert np.abs(heights[seen] - 0.02).max() < 0.01
+    dataset = LeRobotDataset("test/robot", root=tmp_path / "robot")  # as training reads it: millimetres
+    step = ViewsProcessorStep(
+        [view], "front", calibration=plain_calibration(read_calibration(file)), gripper=[],
+        depth_units={keys.depth("front"): "mm"},
+    )  # fmt: skip
+    observed = {key: dataset[0][key][None] for key in (keys.rgb("front"), keys.depth("front"))}
+    online = step.observation(observed)[keys.view("front", "reproj_seen")]
+    assert ((online[0, 0] > 0.5).numpy() == seen[0, 0]).mean() > 0.97

@@ -23,6 +23,7 @@ OPTIONS = [
     ("reproj", {"infill": "none", "clip": 0.05, "height": False}),
     ("persp", {}),
     ("persp", {"plane_height": "gripper", "gripper": False}),
+    ("reproj", {"flying_limit": 0.05}),
 ]
 
 
