@@ -307,7 +307,8 @@ def _metres(depth: Tensor, unit: float) -> Tensor:
 
 def _without_minimum(depth: Tensor) -> Tensor:
     """Return depth in metres with 0 for the pixels that LeRobot's depth videos clip to their minimum."""
-    return torch.where(depth > VIDEO_MINIMUM * ABOVE_MINIMUM, depth, torch.zeros_like(depth))
+    is_lost = (depth - VIDEO_MINIMUM).abs() <= VIDEO_MINIMUM * (ABOVE_MINIMUM - 1)
+    return torch.where(is_lost, torch.zeros_like(depth), depth)
 
 
 def _numbers(key: str, numbers: Tensor, shape: tuple[int, ...], count: int) -> NDArray[np.floating]:
