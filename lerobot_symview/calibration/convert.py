@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_symview.calibration.file import POSES, parse_calibration, parse_workspace, plain_depth_sensor
+from lerobot_symview.calibration.file import METRES, POSES, parse_calibration, parse_workspace, plain_depth_sensor
 from lerobot_symview.calibration.formats import FORMATS, CameraFacts, Facts, Format, parse, recognise
 from lerobot_symview.calibration.formats.document import Document, read_document
 from lerobot_symview.calibration.formats.facts import Pose, Size
@@ -64,7 +64,7 @@ def convert(
             content = _our_content(file, document)
             cameras = content.get("cameras")
             name, entries = _pick(file, cameras if isinstance(cameras, Mapping) else {}, camera)
-            source = _from_ours(file, entries)
+            source = _from_ours(file, entries, METRES.get(str(content.get("units", "m")), 1.0))
             units = content.get("units", "m") if "pose" in source.parts else units
             workspaces += [content["workspace"]] if content.get("workspace") is not None else []
         else:
@@ -76,6 +76,8 @@ def convert(
     if workspaces:
         workspace = parse_workspace(workspaces[0])
     entries = _join(sources, camera, size)
+    if "depth_sensor" in entries:
+        entries["depth_sensor"] = _scaled(entries["depth_sensor"], 1 / METRES.get(str(units), 1.0))
     pose = next(((source.file, source.pose) for source in sources if source.pose is not None), None)
     if pose is not None:
         try:
@@ -148,7 +150,8 @@ def _from_facts(file: Path, facts: CameraFacts) -> _Source:
     return _Source(file, parts, facts.pose)
 
 
-def _from_ours(file: Path, entries: Any) -> _Source:
+def _from_ours(file: Path, entries: Any, metres: float) -> _Source:
+    """Return the parts of our own file; its depth sensor in metres, as that of other tools, whatever its units."""
     if not isinstance(entries, Mapping):
         raise CalibrationError(f"{file}: expected a mapping for the camera, got {entries!r}")
     part_of = dict.fromkeys((*POSES, "quaternion_xyzw"), "pose")
@@ -156,8 +159,26 @@ def _from_ours(file: Path, entries: Any) -> _Source:
     part_of |= {"depth_unit": "depth unit", "depth_sensor": "depth sensor"}
     parts: dict[str, dict[str, Any]] = {}
     for key, value in entries.items():
-        parts.setdefault(part_of.get(key, "intrinsics"), {})[key] = value
+        part = part_of.get(key, "intrinsics")
+        parts.setdefault(part, {})[key] = _scaled(value, metres) if key == "depth_sensor" else value
     return _Source(file, parts)
+
+
+def _scaled(depth_sensor: Any, factor: float) -> Any:
+    """Return a depth sensor's entries with another unit of length; what is no sensor is left to `parse_calibration`."""
+    if not isinstance(depth_sensor, Mapping):
+        return depth_sensor
+    entries = dict(depth_sensor)
+    try:
+        if "position" in entries:
+            entries["position"] = (np.array(entries["position"], dtype=float) * factor).tolist()
+        elif "color_from_depth" in entries:
+            matrix = np.array(entries["color_from_depth"], dtype=float)
+            matrix[:3, 3] *= factor
+            entries["color_from_depth"] = matrix.tolist()
+    except (TypeError, ValueError, IndexError):
+        return depth_sensor
+    return entries
 
 
 def _join(sources: Sequence[_Source], camera: str, size: Size | None) -> dict[str, Any]:

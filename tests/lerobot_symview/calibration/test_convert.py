@@ -264,3 +264,35 @@ def test_files_as_tools_write_them_are_joined(write, intrinsics, pose):
     for source in sources:
         with pytest.raises(CalibrationError, match="add a file with"):
             convert([source], "front", SIZE)
+
+
+DEPTH = {"640x576": {"intrinsic": {"fx": 500.0, "fy": 501.0, "cx": 320.5, "cy": 287.5}}}
+SENSOR = {"intrinsics": [500.0, 501.0, 320.5, 287.5], "position": [-32.1, 0.5, 1.5], "quaternion_xyzw": [0, 0, 0, 1]}
+
+
+@pytest.mark.parametrize("source", ["orbbec", "ours"])
+@pytest.mark.parametrize("pose_units", ["m", "mm"])
+def test_the_place_of_a_depth_sensor_keeps_its_unit_whatever_the_pose_has(write, source, pose_units):
+    pose = orbit_pose(0.8, 0.3, 0.9, (0.45, 0.0, 0.0))
+    pose[:3, 3] *= {"m": 1, "mm": 1000}[pose_units]
+    placed = {"units": pose_units, "cameras": {"front": {"world_from_cam": pose.tolist()}}}
+    given = [write("pose.yaml", yaml.safe_dump(placed)), write("k.json", files.orbbec(depth=DEPTH))]
+    if source == "ours":
+        given[1] = write("k.json", files.realsense(coeffs=[0] * 5))
+        given.append(
+            write("depth.yaml", yaml.safe_dump({"units": "mm", "cameras": {"front": {"depth_sensor": SENSOR}}}))
+        )
+    camera = parse_calibration(convert(given, "front", SIZE, Workspace())).camera("front")
+    np.testing.assert_allclose(camera.depth_sensor.color_from_depth[:3, 3], [-0.0321, 0.0005, 0.0015], atol=1e-7)
+    np.testing.assert_allclose(camera.depth_sensor.intrinsics[:2, 2], [320.5, 287.5])
+    again = parse_calibration(plain_calibration(parse_calibration(convert(given, "front", SIZE, Workspace()))))
+    np.testing.assert_array_equal(
+        again.camera("front").depth_sensor.color_from_depth, camera.depth_sensor.color_from_depth
+    )
+
+
+def test_depth_of_several_sizes_gives_no_depth_sensor(write):
+    several = DEPTH | {"320x288": DEPTH["640x576"]}
+    placed = {"units": "m", "cameras": {"front": {"world_from_cam": orbit_pose(0.8, 0, 0.9, (0.45, 0, 0)).tolist()}}}
+    given = [write("pose.yaml", yaml.safe_dump(placed)), write("k.json", files.orbbec(depth=several))]
+    assert parse_calibration(convert(given, "front", SIZE, Workspace())).camera("front").depth_sensor is None

@@ -120,13 +120,13 @@ def realsense(**changes) -> str:
     return json.dumps(values | {"model": "distortion.brown_conrady", "coeffs": LENS} | changes)
 
 
-def orbbec() -> str:
+def orbbec(**more) -> str:
     intrinsic = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
     lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), LENS, strict=True)) | {"k4": 0, "k5": 0, "k6": 0}
     small = {"intrinsic": {name: value / 2 for name, value in intrinsic.items()}, "distortion": lens}
     depth_to_color = {"rotation": np.eye(3).ravel().tolist(), "translation": [-32.1, 0.5, 1.5]}
     blocks = {"640x360": small, f"{WIDTH}x{HEIGHT}": {"intrinsic": intrinsic, "distortion": lens}}
-    return json.dumps(blocks | {"depth_to_color": depth_to_color})
+    return json.dumps(blocks | {"depth_to_color": depth_to_color} | more)
 
 
 def azure_kinect() -> str:
