@@ -23,12 +23,13 @@ from lerobot_symview.datasets.calibration_check import check_calibration, with_d
 from lerobot_symview.datasets.features import Features, is_depth_feature
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
-from lerobot_symview.geometry.camera import Camera, project
-from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE
+from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.visibility import MILLIMETRE, MINIMUM_VISIBLE, table_resolution
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
+from symview_eval.camera_check import check_camera
 from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
 from symview_eval.rerun_recording import RerunRecording
 
@@ -37,10 +38,8 @@ logger = logging.getLogger(__name__)
 EXAMPLES = """\
   symview-preview --dataset.repo_id=me/picking
   symview-preview --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --episodes='[0, 7]' \\
-      --reproj.source_scale=2 --output_dir=preview"""
-
-LATTICE = 9  # points per side of the workspace where the camera's resolution is measured
-MILLIMETRE = 0.001
+      --reproj.source_scale=2 --output_dir=preview
+  symview-preview --dataset.repo_id=me/real --camera=front --check=true"""
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,9 @@ class PreviewConfig:
     default that of the calibration file, else the dataset's, else the simulator's. The gripper's x and y are relative
     to its centre.
     """
+    check: bool = False
+    """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
+    the camera as it stands in the last of them."""
     max_holes: float = 0.5
     """Fraction of a reprojected view's pixels that may be inferred before a warning is given."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
@@ -189,6 +191,10 @@ def preview(config: PreviewConfig) -> Path:
     if reader is not None:
         with flagged(f"--camera={config.camera}, --calibration, --depth_unit"):
             check_calibration(reader)
+        if config.check:
+            check_camera(reader, config.output_dir)
+    elif config.check:
+        raise ValueError("--check needs the camera's images: the dataset has views only")
     return config.output_dir
 
 
@@ -295,21 +301,6 @@ def _warnings(
                 "or a closer camera or one with a higher resolution"
             )
     return warnings
-
-
-def table_resolution(camera: Camera, workspace: Workspace) -> float:
-    """Return the camera's lowest resolution on the table, over points and directions, pixels per millimetre.
-
-    It is zero if a part of the workspace lies behind the camera.
-    """
-    steps = np.linspace(0.5 / LATTICE, 1 - 0.5 / LATTICE, LATTICE) * workspace.size - workspace.size / 2
-    x, y = np.meshgrid(steps + workspace.center[0], steps + workspace.center[1])
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
-    here, depth = project(points, camera)
-    if (depth <= 0).any():
-        return 0.0
-    moved = [project(points + step, camera)[0] - here for step in np.eye(3)[:2] * MILLIMETRE]
-    return float(np.linalg.svd(np.stack(moved, axis=-1), compute_uv=False)[:, -1].min())
 
 
 def _displayable(image: NDArray) -> NDArray[np.uint8]:

@@ -12,6 +12,8 @@ from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera, ideal_pixels, invert_rigid, project
 from lerobot_symview.geometry.workspace import Workspace
 
+MILLIMETRE = 0.001  # metres
+LATTICE = 9  # points per side of the workspace where the camera's resolution is measured
 MINIMUM_VISIBLE = 0.6  # fraction of the working volume
 LEAST_VISIBLE = 0.1  # a camera that sees less, fixed or moving, makes empty views
 MINIMUM_PIXELS = 8.0  # side of the workspace in the image, as of the smallest view
@@ -145,3 +147,18 @@ def _scaled(pose: Array, metres: float) -> Array:
     scaled = pose.copy()
     scaled[:3, 3] *= metres
     return scaled
+
+
+def table_resolution(camera: Camera, workspace: Workspace) -> float:
+    """Return the camera's lowest resolution on the table, over points and directions, pixels per millimetre.
+
+    It is zero if a part of the workspace lies behind the camera.
+    """
+    steps = np.linspace(0.5 / LATTICE, 1 - 0.5 / LATTICE, LATTICE) * workspace.size - workspace.size / 2
+    x, y = np.meshgrid(steps + workspace.center[0], steps + workspace.center[1])
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1)
+    here, depth = project(points, camera)
+    if (depth <= 0).any():
+        return 0.0
+    moved = [project(points + step, camera)[0] - here for step in np.eye(3)[:2] * MILLIMETRE]
+    return float(np.linalg.svd(np.stack(moved, axis=-1), compute_uv=False)[:, -1].min())

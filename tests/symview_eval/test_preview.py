@@ -1,19 +1,31 @@
 import logging
+import re
 
+import cv2
 import numpy as np
 import pytest
+import yaml
+from lerobot.datasets import LeRobotDataset, merge_datasets
 
+from lerobot_symview.calibration.file import Calibration, plain_calibration
+from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.errors import SymviewError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.visibility import table_resolution
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation
 from lerobot_symview.views import make_view
 from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
-from symview_eval.preview import PreviewConfig, preview, read_samples, table_resolution
-from tests.helpers.cameras import make_camera
-from tests.helpers.datasets import views_config
+from symview_eval.preview import PreviewConfig, preview, read_samples
+from symview_sim.generate import GenerateConfig, RecordedEnv, generate
+from symview_sim.settings import NewDataset
+from tests.helpers.boards import K, pose_errors
+from tests.helpers.cameras import make_camera, plane_depth
+from tests.helpers.datasets import in_mm, record_real_robot, views_config
+from tests.helpers.tables import TABLE, textured_table
 
 
 def config(source, folder, **options):
@@ -146,3 +158,52 @@ def test_a_recording_has_points_and_stored_views(with_views, tmp_path):
     preview(config(with_views, tmp_path, frames=1, rerun=True))
     paths = {chunk.entity_path for chunk in RrdReader(tmp_path / "preview.rrd").stream()}
     assert {"/world/points", "/views/side_reproj", "/views/side_reproj_height", "/views/side_persp"} <= paths
+
+
+def record_moving(folder, turns_px):
+    """Record one-frame episodes of a robot with a camera that turns by some pixels before each of them."""
+    before = Camera(K, orbit_pose(0.8, 0.3, 0.9, TABLE), 480, 640)
+    depth = in_mm(plane_depth(before))
+    for episode, pixels in enumerate(turns_px):
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(np.array([0.0, np.arctan(pixels / K[0, 0]), 0.0]))[0]
+        camera = Camera(K, before.world_from_cam @ turn, 480, 640)
+        record_real_robot(folder / str(episode), textured_table(camera, seed=episode), depth, depth_unit="mm")
+    datasets = [LeRobotDataset("test/part", root=folder / str(episode)) for episode in range(len(turns_px))]
+    merge_datasets(datasets, output_repo_id="test/moving", output_dir=folder / "merged")
+    file = folder / "cameras.yaml"
+    file.write_text(yaml.safe_dump(plain_calibration(Calibration({"front": before}))))
+    return folder / "merged", file, before
+
+
+def test_a_camera_that_moves_by_three_pixels_is_found_and_its_pose_is_written(tmp_path, caplog):
+    folder, file, before = record_moving(tmp_path, [0, 0, 3, 3])
+    with caplog.at_level(logging.INFO):
+        preview(config(folder, tmp_path / "out", camera="front", calibration=file, check=True))
+    (warning,) = [record.getMessage() for record in caplog.records if "was moved" in record.getMessage()]
+    assert re.search(r"camera 'front' was moved since episode 0: its image by (2\.[7-9]|3\.[0-4]) pixels \(up to \d", warning)
+    assert "in the episodes 2, 3" in warning
+    now = read_calibration(tmp_path / "out" / "cameras.yaml").camera("front")
+    turn = np.rad2deg(np.arctan(3 / K[0, 0]))
+    assert pose_errors(before, now.world_from_cam)[0] == pytest.approx(turn, abs=0.05)
+
+
+def test_a_camera_that_stands_still_is_said_to(tmp_path, caplog):
+    folder, file, _ = record_moving(tmp_path, [0, 0])
+    with caplog.at_level(logging.INFO):
+        preview(config(folder, tmp_path / "out", camera="front", calibration=file, check=True))
+    assert re.search(r"camera 'front' stands still: its image moves by at most 0\.\d pixels", caplog.text)
+    assert not (tmp_path / "out" / "cameras.yaml").exists()
+
+
+def test_a_camera_of_another_pose_in_every_episode_is_not_compared(tmp_path, caplog):
+    env = RecordedEnv(camera=CameraSpec(spread=CameraSpread(azimuth_deg=90.0)), oracle=False)
+    source = generate(GenerateConfig(NewDataset("test/spread", tmp_path / "spread"), env=env, num_episodes=2))
+    with caplog.at_level(logging.INFO):
+        preview(config(source, tmp_path / "out", check=True))
+    assert "every episode has a calibration of its own" in caplog.text
+
+
+def test_a_dataset_of_views_alone_cannot_be_checked(only_views, tmp_path):
+    with pytest.raises(ValueError, match="--check needs the camera's images"):
+        preview(config(only_views, tmp_path, check=True))
