@@ -181,7 +181,9 @@ def test_a_camera_that_moves_by_three_pixels_is_found_and_its_pose_is_written(tm
     with caplog.at_level(logging.INFO):
         preview(config(folder, tmp_path / "out", camera="front", calibration=file, check=True))
     (warning,) = [record.getMessage() for record in caplog.records if "was moved" in record.getMessage()]
-    assert re.search(r"camera 'front' was moved since episode 0: its image by (2\.[7-9]|3\.[0-4]) pixels \(up to \d", warning)
+    assert re.search(
+        r"camera 'front' was moved since episode 0: its image by (2\.[7-9]|3\.[0-4]) pixels \(up to \d", warning
+    )
     assert "in the episodes 2, 3" in warning
     now = read_calibration(tmp_path / "out" / "cameras.yaml").camera("front")
     turn = np.rad2deg(np.arctan(3 / K[0, 0]))
