@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview.calibration.board import DICTIONARIES, Board, board_pattern, pixels_per_square
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array
+from lerobot_symview.geometry.camera import Array, Camera, from_ideal
 
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12",
             "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11")  # fmt: skip
@@ -86,6 +86,21 @@ def find_board_through_lens(image: NDArray[np.uint8], board: Board, matrix: Arra
     rays = np.column_stack([corners.pixels, np.ones(len(corners))]) @ np.linalg.inv(matrix).T
     pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, distortion)
     return Corners(corners.board, pixels[:, 0])
+
+
+def find_board_through_fisheye(image: NDArray[np.uint8], board: Board, camera: Camera) -> Corners:
+    """Find the corners of a board as `find_board` does, in the image that a pinhole camera with the same K would take.
+
+    The corners are ideal pixels; parts of the image beyond the pinhole's field of view are not searched.
+
+    Args:
+        image: (H, W, 3) uint8 RGB or (H, W) uint8.
+        board: the board that the image should show.
+        camera: of the image; its pose does not matter.
+    """
+    ideal = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
+    u, v = np.moveaxis(from_ideal(ideal, camera), -1, 0).astype(np.float32)
+    return find_board(cv2.remap(image, u, v, cv2.INTER_LINEAR), board)
 
 
 def _spans_plane(corners: Corners, board: Board) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from lerobot_symview.calibration.board_corners import Corners
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, DepthSensor, calibration_problems, invert_rigid
+from lerobot_symview.geometry.lens import Lens
 
 CORNER_NOISE = 0.1  # pixels: corners in photographs are not located better
 LARGE_ERROR = 0.003  # of the image's width: RMS reprojection error beyond which corners and camera disagree
@@ -33,11 +34,13 @@ class Intrinsics:
     Args:
         matrix: (3, 3) float64, K in pixels.
         distortion: (N,) float64, OpenCV's coefficients k1, k2, p1, p2, k3, ...; empty = none.
+        fisheye: the lens in place of `distortion`, through which corners are found as ideal pixels.
         depth_sensor: the camera of its depth images; None where these are aligned with colour.
     """
 
     matrix: Array
     distortion: Array = field(default_factory=lambda: np.zeros(0))
+    fisheye: Lens | None = None
     depth_sensor: DepthSensor | None = None
 
 

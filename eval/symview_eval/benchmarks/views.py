@@ -86,8 +86,8 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
         `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `vga_ms`,
         `vga_lens_ms`, `vga_unaligned_ms` and `hd_ms`: a frame of 640 x 480 pixels reprojected, the same with a lens,
         the same with depth from a sensor of its own, and a frame of 1280 x 720. `vga_lens_ratio` and
-        `vga_unaligned_ratio`: the second and third over the first; the aim is 2. `batched_*`, on a GPU: time per frame of
-        a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on reading, decoding,
+        `vga_unaligned_ratio`: the second and third over the first; the aim is 2. `batched_*`, on a GPU: time per frame
+        of a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on reading, decoding,
         encoding and writing, for images with a real camera's noise. `offline_two_process_speedup`: speed-up by a second
         process including its start-up, most of which falls into the first round. `frames_per_s`: frames for which one
         process makes both views.

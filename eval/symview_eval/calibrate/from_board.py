@@ -8,7 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.calibration.board import Board
-from lerobot_symview.calibration.board_corners import Corners, find_board, find_board_through_lens
+from lerobot_symview.calibration.board_corners import (
+    Corners,
+    find_board,
+    find_board_through_fisheye,
+    find_board_through_lens,
+)
 from lerobot_symview.calibration.board_pose import (
     EstimatedIntrinsics,
     Intrinsics,
@@ -18,7 +23,7 @@ from lerobot_symview.calibration.board_pose import (
 )
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.camera import Camera, from_ideal
 from lerobot_symview.geometry.lens import EQUIDISTANT, lens_from_coefficients
 from lerobot_symview.runtime.cli import CommandError, flagged
 from symview_eval.calibrate.config import CalibrateConfig
@@ -74,7 +79,7 @@ def from_board(config: CalibrateConfig) -> Result:
         corners = _find(image, config.board, intrinsics)
     with flagged(f"{pose_image}, --board, --intrinsics"):
         pose = board_pose(corners, intrinsics, width)
-        lens = lens_from_coefficients(None, intrinsics.distortion)
+        lens = intrinsics.fisheye or lens_from_coefficients(None, intrinsics.distortion)
         world_from_camera = world_from_cam(pose, config.board.world_from_board)
         camera = Camera(intrinsics.matrix, world_from_camera, height, width, lens, intrinsics.depth_sensor)
     caption = f"{len(corners)} corners, reprojection error {pose.error_px:.2f} px, {pose.error_mm:.2f} mm on the table"
@@ -85,10 +90,15 @@ def from_board(config: CalibrateConfig) -> Result:
         pose.uncertainty_deg,
         pose.uncertainty_mm,
     )
-    return Result(camera, image, corners.pixels, caption)
+    pixels = corners.pixels if intrinsics.fisheye is None else from_ideal(corners.pixels, camera)
+    return Result(camera, image, pixels, caption)
 
 
 def _find(image: NDArray[np.uint8], board: Board, intrinsics: Intrinsics) -> Corners:
+    if intrinsics.fisheye is not None:
+        height, width = image.shape[:2]
+        camera = Camera(intrinsics.matrix, np.eye(4), height, width, intrinsics.fisheye)
+        return find_board_through_fisheye(image, board, camera)
     if not intrinsics.distortion.any():
         return find_board(image, board)
     return find_board_through_lens(image, board, intrinsics.matrix, intrinsics.distortion)
@@ -124,11 +134,8 @@ def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intri
         if camera.lens is None:
             return Intrinsics(camera.intrinsics, depth_sensor=camera.depth_sensor)
         if camera.lens.model == EQUIDISTANT:
-            raise CalibrationError(
-                f"--intrinsics: camera {name!r} has an {EQUIDISTANT} lens, with which no pose is found from a board: "
-                "undistort the images, or estimate the intrinsics from them"
-            ) from None
-        return Intrinsics(camera.intrinsics, np.array(camera.lens.coefficients), camera.depth_sensor)
+            return Intrinsics(camera.intrinsics, fisheye=camera.lens, depth_sensor=camera.depth_sensor)
+        return Intrinsics(camera.intrinsics, np.array(camera.lens.coefficients), depth_sensor=camera.depth_sensor)
     return Intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
 
 

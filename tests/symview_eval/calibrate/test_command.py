@@ -19,7 +19,8 @@ from lerobot_symview.calibration.board import Board
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
-from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.camera import Camera, stored_camera, to_ideal
+from lerobot_symview.geometry.lens import EQUIDISTANT, Lens
 from lerobot_symview.geometry.workspace import Workspace
 from symview_eval.calibrate import command
 from tests.helpers.boards import K, camera_over, close_views, photograph, pose_errors
@@ -283,6 +284,26 @@ def test_depth_puts_the_table_at_zero(run, tmp_path, suffix):
     assert np.rad2deg(np.arccos(up[2])) < 0.1
     assert np.rad2deg(np.linalg.norm(cv2.Rodrigues(rotation)[0])) < 0.2
     assert abs(refined.camera("front").position[2] - CAMERA.position[2]) < 0.002
+
+
+def test_a_photograph_through_a_fisheye_gives_the_pose(run, tmp_path):
+    lens = Lens(EQUIDISTANT, (0.05, -0.01, 0.002, 0.0))
+    camera = replace(camera_over(Board(), 55, 20, 0.6), lens=lens)
+    ideal = to_ideal(np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1), camera)
+    wide_k = K + [[0, 0, 320], [0, 0, 240], [0, 0, 0]]
+    wide = photograph(Board(), Camera(wide_k, camera.world_from_cam, 960, 1280), noise=0.0)
+    u, v = np.moveaxis(ideal + [320, 240], -1, 0).astype(np.float32)
+    save(tmp_path / "photo.png", cv2.remap(wide, u, v, cv2.INTER_LINEAR))
+    known = plain_calibration(Calibration({"front": replace(camera, world_from_cam=CAMERA.world_from_cam)}))
+    (tmp_path / "lens.yaml").write_text(yaml.safe_dump(known))
+    code, error, _ = run("--images=photo.png", "--intrinsics=lens.yaml", "--camera=front")
+    assert code == 0, error
+    found = read_calibration("cameras.yaml").camera("front")
+    degrees, millimetres = pose_errors(camera, found.world_from_cam)
+    assert degrees < 0.1
+    assert millimetres < 1
+    assert found.lens.model == EQUIDISTANT
+    np.testing.assert_allclose(found.lens.coefficients, lens.coefficients, atol=1e-6)
 
 
 def test_a_calibration_that_is_far_off_is_not_refined(run, tmp_path):
