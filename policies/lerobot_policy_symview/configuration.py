@@ -10,6 +10,7 @@ from typing import Any, Literal
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, LRSchedulerConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
 from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.methods import METHODS
@@ -36,6 +37,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "theta_representation": ("sign", "trivial"),
     "augmentation": ("none", "d4", "so2", "o2", "group"),
     "dtype": ("float32", "bfloat16"),
+    "learning_rate_decay": ("none", "cosine"),
 }
 UNUSED_OUTPUTS = {"reproj": {"mask": False}, "persp": {"gripper": False}}
 
@@ -89,6 +91,8 @@ class SymviewConfig(PreTrainedConfig):
     """Transform every training sample, action included, by a random element of D4, SO(2), O(2) or `group`."""
     learning_rate: float = 1e-3
     """Of Adam."""
+    learning_rate_decay: Literal["none", "cosine"] = "none"
+    """`cosine` anneals the learning rate to zero; `none` keeps it constant, as in the paper."""
     weight_averaging: float = 0.0
     """Decay of an exponential moving average of the weights, used in evaluation, such as 0.995; 0 for none, as in the
     paper."""
@@ -360,7 +364,9 @@ class SymviewConfig(PreTrainedConfig):
         return AdamConfig(lr=self.learning_rate)
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        """Return no schedule: the learning rate is constant."""
+        """Return the schedule that `learning_rate_decay` names."""
+        if self.learning_rate_decay == "cosine":
+            return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=0)
         return None
 
     @property

@@ -39,6 +39,10 @@ class SymviewSacfdConfig(SymviewConfig):
     """Polyak coefficient tau: target = (1 - tau) target + tau critic."""
     target_interval: int = 100
     """Updates between copies of the critic, with `--policy.target_update=hard`."""
+    grad_clip_norm: float | None = None
+    """Largest norm of the actor's and of the critic's gradient; None for no limit, as in the paper. Without it, single
+    gradients that are twenty to sixty times as large as others move the actor far from the demonstrations.
+    """
     timeouts_are_terminal: bool = False
     """Do not bootstrap from the last observation of an episode that ran out of time. By default the TD target
     bootstraps there, since a time limit says nothing about the value of a state; the code the paper builds on does not.
@@ -57,6 +61,8 @@ class SymviewSacfdConfig(SymviewConfig):
             raise ValueError(f"--policy.bc_weight must not be negative, got {self.bc_weight}")
         if self.target_entropy is not None and not math.isfinite(self.target_entropy):
             raise ValueError(f"--policy.target_entropy must be finite, got {self.target_entropy}")
+        if self.grad_clip_norm is not None and not 0 < self.grad_clip_norm < math.inf:
+            raise ValueError(f"--policy.grad_clip_norm must be positive and finite, got {self.grad_clip_norm}")
         if self.target_interval < 1:
             raise ValueError(f"--policy.target_interval must be at least 1, got {self.target_interval}")
 

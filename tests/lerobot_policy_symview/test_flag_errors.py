@@ -57,6 +57,7 @@ WRONG = {
         "target_update": ("soft", "target_update.*'soft'.*polyak"),
         "target_tau": (1.5, "--policy.target_tau must be above 0 and at most 1, got 1.5"),
         "target_interval": (0, "--policy.target_interval must be at least 1, got 0"),
+        "grad_clip_norm": (0.0, "--policy.grad_clip_norm must be positive and finite, got 0.0"),
         "timeouts_are_terminal": ("perhaps", "timeouts_are_terminal.*'perhaps'"),
     },
     "symview": {

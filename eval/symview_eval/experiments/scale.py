@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 Algorithm = Literal["bc", "sacfd"]
@@ -52,14 +52,17 @@ class Scale:
     """Learning rate schedule of behaviour cloning; `cosine` decays the rate to zero."""
     aperture_noise: float = 0.0
     """Noise on the gripper's aperture in the training of behaviour cloning."""
+    rl_policy: dict[str, Any] = field(default_factory=dict, hash=False)
+    """Policy settings of reinforcement learning."""
     dtype: str = "float32"
     """Precision of convolutions."""
 
     def policy(self, algorithm: Algorithm) -> dict[str, Any]:
         """Return the policy settings that the scale determines."""
         names = ["width", "crop_size", "weight_averaging", "dtype"]
-        names += ["learning_rate_decay", "aperture_noise"] if algorithm == "bc" else []
-        return {name: getattr(self, name) for name in names}
+        if algorithm == "sacfd":
+            return {name: getattr(self, name) for name in names} | self.rl_policy
+        return {name: getattr(self, name) for name in [*names, "learning_rate_decay", "aperture_noise"]}
 
     def __str__(self) -> str:
         return ", ".join(f"{setting.name}={getattr(self, setting.name)}" for setting in fields(self))
@@ -95,14 +98,15 @@ SCALES = {
             evaluations=1,
             eval_episodes=60,
             placement_episodes=20,
-            rl_steps=400,
+            rl_steps=750,
             rl_batch_size=32,
-            rl_eval_every=100,
+            rl_eval_every=150,
             rl_eval_episodes=20,
             simulators=4,
             weight_averaging=0.99,
             learning_rate_decay="cosine",
             aperture_noise=0.03,
+            rl_policy={"bc_weight": 10.0, "grad_clip_norm": 10.0, "learning_rate_decay": "cosine"},
         ),
         Scale(
             "smoke",

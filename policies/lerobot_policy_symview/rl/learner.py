@@ -34,10 +34,12 @@ class Learner(nn.Module):
 
     Args:
         policy: the actor.
+        steps: updates of the whole training, over which `learning_rate_decay` anneals the rates of actor and critic.
     """
 
-    def __init__(self, policy: SymviewSacfdPolicy):
+    def __init__(self, policy: SymviewSacfdPolicy, steps: int = 1):
         super().__init__()
+        self.steps = steps
         config = policy.config
         device = policy.action_center.device
         self.config, self.policy, self.codec = config, policy, ObservationCodec(policy.scene)
@@ -95,6 +97,10 @@ class Learner(nn.Module):
         for name, loss in (("actor", actor_loss), ("critic", critic_loss), ("temperature", temperature_loss)):
             self.optimizers[name].zero_grad()
             loss.backward()
+        if self.config.grad_clip_norm is not None:
+            for network in (self.policy, self.critic):
+                nn.utils.clip_grad_norm_(network.parameters(), self.config.grad_clip_norm)
+        self._anneal()
         for optimizer in self.optimizers.values():
             optimizer.step()
         self._update_target()
@@ -146,6 +152,13 @@ class Learner(nn.Module):
         state |= {name: value for name, value in self.state_dict().items() if name.startswith("policy.")}
         self.load_state_dict(state)
         load_optimizer_state(self.optimizers, folder)
+
+    def _anneal(self) -> None:
+        if self.config.learning_rate_decay == "cosine":
+            share = min(1.0, int(self.updates) / self.steps)
+            for name in ("actor", "critic"):
+                for group in self.optimizers[name].param_groups:
+                    group["lr"] = self.config.learning_rate * (1 + math.cos(math.pi * share)) / 2
 
     @torch.no_grad()
     def _update_target(self) -> None:

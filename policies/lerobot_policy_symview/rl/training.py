@@ -61,7 +61,7 @@ class Training:
         self.policy = SymviewSacfdPolicy(policy, ranges(dataset, (space.low, space.high)))
         self.policy.to(policy.device)
         self.actor = Actor(self.policy)
-        self.learner = Learner(self.policy)
+        self.learner = Learner(self.policy, config.steps)
         self.simulator_config = simulator_config(policy, config.env)
         self.replay = self._empty_replay()
         self.simulators = Simulators(self.simulator_config, config.num_simulators)

@@ -246,3 +246,31 @@ def test_a_loaded_learner_makes_the_same_updates(tmp_path):
             learner.update(sample)
     for first, second in zip(ours.state_dict().values(), other.state_dict().values(), strict=True):
         assert torch.equal(first, second)
+
+
+def test_gradients_are_cut_at_their_norm():
+    """Adam's first moment tells the gradient's norm: after one step it is a tenth of the gradient."""
+    free, cut = (Learner(make_actor(method="sideview_nonequi", grad_clip_norm=norm)) for norm in (None, 1e-3))
+    cut.load_state_dict(free.state_dict())
+    norms = {}
+    for learner in (free, cut):
+        torch.manual_seed(1)
+        learner.update(make_sample(learner))
+        for name in ("actor", "critic"):
+            moments = [state["exp_avg"] for state in learner.optimizers[name].state.values()]
+            norms[learner, name] = 10 * torch.stack([moment.norm() for moment in moments]).norm().item()
+    for name in ("actor", "critic"):
+        assert norms[free, name] > 1e-2
+        assert norms[cut, name] == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_the_learning_rates_decay_along_a_cosine_to_zero():
+    learner = Learner(make_actor(method="sideview_nonequi", learning_rate_decay="cosine"), steps=4)
+    sample, rates = make_sample(learner), []
+    for _ in range(5):
+        learner.update(sample)
+        rates.append({name: optimizer.param_groups[0]["lr"] for name, optimizer in learner.optimizers.items()})
+    for name in ("actor", "critic"):
+        expected = [1e-3 * (1 + math.cos(math.pi * share)) / 2 for share in (0, 0.25, 0.5, 0.75, 1.0)]
+        assert [rate[name] for rate in rates] == pytest.approx(expected, abs=1e-9)
+    assert {rate["temperature"] for rate in rates} == {1e-3}
