@@ -14,7 +14,6 @@ from lerobot_symview.calibration.drift import Drift, image_drift, moved_camera
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.table_plane import has_depth, levelled
 from lerobot_symview.datasets.frame_reader import FrameReader
-from lerobot_symview.datasets.source import EpisodeTables
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.visibility import table_resolution
@@ -85,7 +84,7 @@ def _measured(reader: FrameReader) -> list[EpisodeDrift]:
     references: dict[Camera, tuple[int, Frame]] = {}
     measured = []
     for episode in tqdm(range(len(reader.dataset.episodes)), desc="check", unit="episode"):
-        frame = _first_frame(reader, episode)
+        frame = reader.frame(episode, 0)
         first, reference = references.setdefault(frame.camera, (episode, frame))
         if first == episode:
             continue
@@ -104,7 +103,7 @@ def _write_moved(reader: FrameReader, moved: EpisodeDrift, output_dir: Path) -> 
         return
     difference = moved.frame.camera.cam_from_world @ camera.world_from_cam
     degrees = np.rad2deg(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
-    frame = _first_frame(reader, moved.episode)
+    frame = reader.frame(moved.episode, 0)
     plane = ""
     if frame.depth is not None and has_depth(frame.depth, camera, reader.workspace):
         try:
@@ -122,8 +121,3 @@ def _write_moved(reader: FrameReader, moved: EpisodeDrift, output_dir: Path) -> 
         1000 * np.linalg.norm(difference[:3, 3]),
         plane,
     )
-
-
-def _first_frame(reader: FrameReader, episode: int) -> Frame:
-    table = EpisodeTables(reader.dataset, reader.dataset.data_file(episode), reader.columns()).read(episode)
-    return next(reader.frames(episode, table.slice(0, 1)))

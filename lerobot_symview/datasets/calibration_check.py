@@ -9,7 +9,6 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.table_plane import TablePlane, check_table, has_depth, likely_depth_unit
 from lerobot_symview.datasets.features import declared_unit
 from lerobot_symview.datasets.frame_reader import FrameReader
-from lerobot_symview.datasets.source import EpisodeTables
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.units import METRES, unit_name
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, MINIMUM_VISIBLE, check_camera
@@ -89,12 +88,7 @@ def _check_tables(reader: FrameReader, frames: dict[int, Frame]) -> TablePlane |
 def _first_frames(reader: FrameReader) -> dict[int, Frame]:
     """Return episode -> its first frame, for the first, the middle and the last episode."""
     count = len(reader.dataset.episodes)
-    return {episode: _frame(reader, episode, 0) for episode in sorted({0, count // 2, count - 1})}
-
-
-def _frame(reader: FrameReader, episode: int, index: int) -> Frame:
-    table = EpisodeTables(reader.dataset, reader.dataset.data_file(episode), reader.columns()).read(episode)
-    return next(reader.frames(episode, table.slice(index, 1)))
+    return {episode: reader.frame(episode, 0) for episode in sorted({0, count // 2, count - 1})}
 
 
 def _unit_by_table(reader: FrameReader, key: str) -> float | None:
@@ -102,7 +96,7 @@ def _unit_by_table(reader: FrameReader, key: str) -> float | None:
     if stored is None:
         return None
     index, depth = stored
-    camera = _frame(replace(reader, views=()), 0, index).camera
+    camera = replace(reader, views=()).frame(0, index).camera
     unit = likely_depth_unit(depth, camera.depth_camera(*depth.shape), reader.workspace)
     if unit is not None:
         logger.info("%s declares no depth_unit: the table at z = 0 shows %s", key, unit_name(unit))

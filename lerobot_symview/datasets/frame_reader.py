@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
 from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature
-from lerobot_symview.datasets.source import SourceDataset, vectors
+from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -115,6 +115,12 @@ class FrameReader:
             except CalibrationError as error:
                 raise CalibrationError(f"episode {episode}, frame {index}, camera {self.camera!r}: {error}") from None
             yield Frame(rgb, aligned, camera, self.workspace, state)
+
+    def frame(self, episode: int, index: int) -> Frame:
+        """Return one frame of an episode, counted from its start."""
+        file = self.dataset.data_file(episode)
+        table = EpisodeTables(self.dataset, file, self.columns()).read(episode)
+        return next(self.frames(episode, table.slice(index, 1)))
 
     def _camera(self, stored: dict[str, NDArray] | None, height: int, width: int) -> Camera:
         if stored is not None:
