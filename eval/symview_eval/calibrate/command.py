@@ -24,6 +24,7 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import flagged, run_command
 from symview_eval.calibrate.config import CalibrateConfig, with_device
 from symview_eval.calibrate.from_board import from_board, photographs
+from symview_eval.calibrate.from_gripper import from_gripper
 from symview_eval.calibrate.output import Result, existing_calibration, replace_file, write_result
 from symview_eval.calibrate.photographs import depth_from_dataset, depth_from_file
 
@@ -35,6 +36,7 @@ EXAMPLES = """\
   symview-calibrate --images=photo.jpg --camera=front --intrinsics=615.3,615.1,319.5,239.5 --board.origin='[0.3, -0.1]'
   symview-calibrate --dataset.repo_id=me/real --camera=front --episodes='[0]' --frames=20
   symview-calibrate --device.type=opencv --device.index_or_path=0 --camera=front --frames=12
+  symview-calibrate --dataset.repo_id=me/real --camera=front --gripper.marker=7 --frames=20 --intrinsics=lens.yaml
   symview-calibrate --calibration=cameras.yaml --refine=table --dataset.repo_id=me/real --camera=front
   symview-calibrate --convert='[camera_info.yaml, handeye.calib]' --camera=front --output=cameras.yaml
   symview-calibrate --convert='[cameras.yaml]' --camera=front --to=camera_info --output=camera_info.yaml"""
@@ -51,8 +53,12 @@ def calibrate(config: CalibrateConfig) -> Path:
     if config.convert:
         return _convert(config)
     known = existing_calibration(config.output)
-    workspace = config.workspace or known.workspace or _about(config.board)
-    if config.calibration is None:
+    workspace = (
+        config.workspace or known.workspace or (Workspace() if config.gripper.is_given else _about(config.board))
+    )
+    if config.gripper.is_given:
+        result = from_gripper(config, workspace)
+    elif config.calibration is None:
         result = from_board(config)
     else:
         with flagged("--calibration"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_symview.calibration.board import Board
+from lerobot_symview.calibration.board import DICTIONARIES, Board
 from lerobot_symview.calibration.readings import PoseReading
 from lerobot_symview.calibration.writers import WRITERS
 from lerobot_symview.geometry.units import parse_unit
@@ -23,6 +23,31 @@ class PrintedBoard(Board):
 
 
 @dataclass(frozen=True)
+class GripperPoint:
+    """A point that is fixed to the gripper, by which the robot's own motions tell the camera's pose."""
+
+    marker: int | None = None
+    """Number of an ArUco marker on the gripper; the point is its centre. The dataset's state must have the gripper's
+    pose: x, y, z, yaw, relative to the workspace's centre, or LeRobot's ee.x to ee.wz, in the frame of its base."""
+    dictionary: str = "4X4_50"
+    """Dictionary of the marker."""
+    points: Path | None = None
+    """CSV file of points picked by hand, in place of a marker: u, v (pixels), x, y, z (of the gripper in the world,
+    metres), and wx, wy, wz (rotation vector) or yaw, if it turns."""
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Place of the point in the gripper's frame, metres, where the motions do not determine it."""
+
+    def __post_init__(self) -> None:
+        if self.dictionary not in DICTIONARIES:
+            raise ValueError(f"unknown --gripper.dictionary {self.dictionary!r}, expected one such as 4X4_50")
+
+    @property
+    def is_given(self) -> bool:
+        """Whether a marker or points are given."""
+        return self.marker is not None or self.points is not None
+
+
+@dataclass(frozen=True)
 class CalibrateConfig:
     """Find a camera's pose, and its intrinsics if they are not known, from images of a printed board on the table.
 
@@ -31,6 +56,8 @@ class CalibrateConfig:
 
     board: PrintedBoard = field(default_factory=PrintedBoard)
     """The board, its place on the table, and where to print it to."""
+    gripper: GripperPoint = field(default_factory=GripperPoint)
+    """A point on the gripper, in place of a board on the table."""
     images: str | None = None
     """Images of the board: a file, a folder, or a pattern such as 'photos/*.jpg'."""
     dataset: DatasetLocation | None = None
@@ -60,7 +87,7 @@ class CalibrateConfig:
     pose: PoseReading = field(default_factory=PoseReading)
     """How to read the pose in `convert`; by default as its file says, else as the reading that sees the workspace."""
     image_size: tuple[int, int] | None = None
-    """Rows and columns of the camera's images, for files in `convert` that do not say them."""
+    """Rows and columns of the camera's images, for `convert` and `gripper.points`, where the files do not say them."""
     to: str = ""
     """Format of the output of `convert`, `camera_info` or `easy_handeye2`; by default our own."""
     output: Path = Path("cameras.yaml")
@@ -79,6 +106,10 @@ class CalibrateConfig:
             raise ValueError("--calibration is what --refine=table corrects: give both")
         if self.refine and self.depth is None and self.dataset is None:
             raise ValueError("--refine=table needs a depth image: --depth, or --dataset with depth")
+        if self.gripper.is_given and not self.intrinsics:
+            raise ValueError("--gripper needs --intrinsics: fx,fy,cx,cy or a calibration file with the camera")
+        if self.gripper.marker is not None and self.dataset is None:
+            raise ValueError("--gripper.marker needs --dataset.repo_id: the gripper's poses are in its state")
         if self.depth_unit is not None:
             try:
                 parse_unit(self.depth_unit)

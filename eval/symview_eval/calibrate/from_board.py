@@ -23,7 +23,7 @@ from lerobot_symview.calibration.board_pose import (
 )
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera, from_ideal
+from lerobot_symview.geometry.camera import Camera, from_ideal, orbit_pose
 from lerobot_symview.geometry.lens import EQUIDISTANT, lens_from_coefficients
 from lerobot_symview.runtime.cli import CommandError, flagged
 from symview_eval.calibrate.config import CalibrateConfig
@@ -31,6 +31,8 @@ from symview_eval.calibrate.output import Result
 from symview_eval.calibrate.photographs import Photographs, from_dataset, from_device, from_files
 
 logger = logging.getLogger(__name__)
+
+ANY_POSE = orbit_pose(1.0, 0.0, 1.0, (0.0, 0.0, 0.0))
 
 
 def photographs(config: CalibrateConfig) -> Photographs:
@@ -115,6 +117,27 @@ def _estimated_intrinsics(images: Photographs, board: Board) -> EstimatedIntrins
     height, width = next(iter(images.values())).shape[:2]
     first = estimate_intrinsics(views, height, width)
     return estimate_intrinsics({name: _find(images[name], board, first) for name in views}, height, width)
+
+
+def given_camera(config: CalibrateConfig, size: tuple[int, ...] | None) -> Camera:
+    """Return the camera of `--intrinsics`, at an arbitrary pose.
+
+    Args:
+        config: of the command.
+        size: rows and columns of its images; None where only a calibration file tells.
+    """
+    if size is None:
+        if "," in config.intrinsics:
+            raise ValueError("--intrinsics=fx,fy,cx,cy needs --image_size='[rows, columns]' beside it")
+        with flagged("--intrinsics"):
+            known = read_calibration(config.intrinsics)
+            camera = known.camera(next(iter(known.cameras)) if len(known.cameras) == 1 else config.camera)
+            size = camera.height, camera.width
+    height, width = size
+    intrinsics = _given_intrinsics(config, height, width)
+    lens = intrinsics.fisheye or lens_from_coefficients(None, intrinsics.distortion)
+    with flagged("--intrinsics"):
+        return Camera(intrinsics.matrix, ANY_POSE, height, width, lens, intrinsics.depth_sensor)
 
 
 def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intrinsics:

@@ -91,7 +91,7 @@ def replace_file(file: Path, text: str) -> None:
 
 def _picture(config: CalibrateConfig, workspace: Workspace, result: Result) -> Any:
     assert result.rgb is not None
-    board = None if config.calibration else config.board.world_from_board
+    board = None if config.calibration or config.gripper.is_given else config.board.world_from_board
     return calibration_picture(
         result.rgb, result.camera, workspace, board, 2 * config.board.square, result.corners, result.caption
     )

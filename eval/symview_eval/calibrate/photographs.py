@@ -59,7 +59,7 @@ def from_dataset(folder: Path, camera: str, episodes: list[int], frames: int) ->
         raise DatasetError(f"the dataset has no camera {camera!r}; it has {', '.join(known) or 'none'}")
     photographs = {}
     for episode in episodes:
-        table = _rows(source, key, episode)
+        table = rows(source, key, episode)
         chosen = np.unique(np.arange(frames) * len(table) // frames).tolist()
         for index in chosen:
             name = f"episode {episode}, frame {index}"
@@ -76,7 +76,7 @@ def depth_from_dataset(folder: Path, camera: str, episode: int, unit: float | No
     source, key = SourceDataset(folder), keys.depth(camera)
     if not is_depth_feature(source.features.get(key, {})):
         raise DatasetError(f"the dataset has no depth feature {key}")
-    return next(source.images(key, episode, _rows(source, key, episode).slice(0, 1), unit))
+    return next(source.images(key, episode, rows(source, key, episode).slice(0, 1), unit))
 
 
 def depth_from_file(file: Path) -> NDArray:
@@ -114,9 +114,9 @@ def from_device(config: Any, frames: int) -> Photographs:
     return photographs
 
 
-def _rows(source: SourceDataset, key: str, episode: int) -> Any:
-    """Return the table of an episode, with the columns that reading the image feature `key` needs."""
+def rows(source: SourceDataset, key: str, episode: int) -> Any:
+    """Return the table of an episode, with the columns that reading the feature `key` needs."""
     if not 0 <= episode < len(source.episodes):
         raise DatasetError(f"the dataset has {len(source.episodes)} episodes, there is no episode {episode}")
-    columns = ["timestamp"] + ([key] if source.features[key]["dtype"] == "image" else [])
+    columns = ["timestamp"] + ([key] if source.features[key]["dtype"] != "video" else [])
     return EpisodeTables(source, source.data_file(episode), columns).read(episode)
