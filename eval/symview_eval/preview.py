@@ -29,8 +29,8 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
-from symview_eval.camera_check import check_camera
 from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
+from symview_eval.drift_check import check_drift
 from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
@@ -160,6 +160,8 @@ def preview(config: PreviewConfig) -> Path:
     if unknown:
         raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0 to {total - 1}")
     reader, views = _chosen(config, source)
+    if config.check and reader is None:
+        raise ValueError("--check needs the camera's images: the dataset has views only")
     config.output_dir.mkdir(parents=True, exist_ok=True)
     recording = None
     if config.rerun and reader is not None:
@@ -189,12 +191,10 @@ def preview(config: PreviewConfig) -> Path:
     (config.output_dir / "preview.html").write_text(page(config.dataset.repo_id, rows, warnings))
     logger.info("wrote %s", ", ".join(str(file) for file in sorted(config.output_dir.glob("preview.*"))))
     if reader is not None:
+        if config.check:
+            check_drift(reader, config.output_dir)
         with flagged(f"--camera={config.camera}, --calibration, --depth_unit"):
             check_calibration(reader)
-        if config.check:
-            check_camera(reader, config.output_dir)
-    elif config.check:
-        raise ValueError("--check needs the camera's images: the dataset has views only")
     return config.output_dir
 
 

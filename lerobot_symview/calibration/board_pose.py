@@ -14,7 +14,8 @@ import numpy as np
 
 from lerobot_symview.calibration.board_corners import Corners
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, DepthSensor, calibration_problems, invert_rigid
+from lerobot_symview.geometry.calibration_problems import calibration_problems
+from lerobot_symview.geometry.camera import Array, DepthSensor, invert_rigid
 from lerobot_symview.geometry.lens import Lens
 
 CORNER_NOISE = 0.1  # pixels: corners in photographs are not located better

@@ -40,8 +40,8 @@ class SymviewSacfdConfig(SymviewConfig):
     target_interval: int = 100
     """Updates between copies of the critic, with `--policy.target_update=hard`."""
     grad_clip_norm: float | None = None
-    """Largest norm of the actor's and of the critic's gradient; None for no limit, as in the paper. Without it, single
-    gradients that are twenty to sixty times as large as others move the actor far from the demonstrations.
+    """Largest norm of the actor's and of the critic's gradient; None for no limit, as in the paper. Single
+    gradients of the actor can be twenty to sixty times as large as others.
     """
     timeouts_are_terminal: bool = False
     """Do not bootstrap from the last observation of an episode that ran out of time. By default the TD target

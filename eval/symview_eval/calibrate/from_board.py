@@ -130,8 +130,7 @@ def given_camera(config: CalibrateConfig, size: tuple[int, ...] | None) -> Camer
         if "," in config.intrinsics:
             raise ValueError("--intrinsics=fx,fy,cx,cy needs --image_size='[rows, columns]' beside it")
         with flagged("--intrinsics"):
-            known = read_calibration(config.intrinsics)
-            camera = known.camera(next(iter(known.cameras)) if len(known.cameras) == 1 else config.camera)
+            _, camera = _known_camera(config)
             size = camera.height, camera.width
     height, width = size
     intrinsics = _given_intrinsics(config, height, width)
@@ -140,15 +139,20 @@ def given_camera(config: CalibrateConfig, size: tuple[int, ...] | None) -> Camer
         return Camera(intrinsics.matrix, ANY_POSE, height, width, lens, intrinsics.depth_sensor)
 
 
+def _known_camera(config: CalibrateConfig) -> tuple[str, Camera]:
+    """Return name and camera of the file in `--intrinsics`: the only one, or that of the wanted name."""
+    known = read_calibration(config.intrinsics)
+    name = next(iter(known.cameras)) if len(known.cameras) == 1 else config.camera
+    return name, known.camera(name)
+
+
 def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intrinsics:
     """Return the intrinsics of the flag, four numbers or a calibration file."""
     try:
         fx, fy, cx, cy = (float(number) for number in config.intrinsics.strip("[]").split(","))
     except ValueError:
         with flagged("--intrinsics"):
-            known = read_calibration(config.intrinsics)
-            name = next(iter(known.cameras)) if len(known.cameras) == 1 else config.camera
-            camera = known.camera(name)
+            name, camera = _known_camera(config)
         if (camera.height, camera.width) != (height, width):
             raise CalibrationError(
                 f"--intrinsics: camera {name!r} has images of {camera.width} x {camera.height} pixels, "

@@ -23,7 +23,7 @@ from lerobot_symview.runtime.cli import flagged
 from symview_eval.calibrate.config import CalibrateConfig
 from symview_eval.calibrate.from_board import given_camera
 from symview_eval.calibrate.output import Result
-from symview_eval.calibrate.photographs import Photographs, from_dataset, rows
+from symview_eval.calibrate.photographs import Photographs, chosen_frames, from_dataset, rows
 
 logger = logging.getLogger(__name__)
 
@@ -133,10 +133,10 @@ def gripper_poses(folder: Path, episodes: list[int], frames: int, chosen: list[s
     poses = {}
     for episode in episodes:
         states = vectors(rows(source, keys.STATE, episode), keys.STATE)
-        for index in np.unique(np.arange(frames) * len(states) // frames).tolist():
+        for name, index in chosen_frames(episode, len(states), frames).items():
             state = states[index].astype(np.float64)[columns]
             offset = [*workspace.center, 0.0] if is_ours else np.zeros(3)
-            poses[f"episode {episode}, frame {index}"] = _poses(state[None, :3] + offset, state[None, 3:])[0]
+            poses[name] = _poses(state[None, :3] + offset, state[None, 3:])[0]
     return np.array([poses[name] for name in chosen]).reshape(-1, 4, 4)
 
 

@@ -60,9 +60,7 @@ def from_dataset(folder: Path, camera: str, episodes: list[int], frames: int) ->
     photographs = {}
     for episode in episodes:
         table = rows(source, key, episode)
-        chosen = np.unique(np.arange(frames) * len(table) // frames).tolist()
-        for index in chosen:
-            name = f"episode {episode}, frame {index}"
+        for name, index in chosen_frames(episode, len(table), frames).items():
             photographs[name] = next(source.images(key, episode, table.slice(index, 1)))
     return photographs
 
@@ -112,6 +110,12 @@ def from_device(config: Any, frames: int) -> Photographs:
     finally:
         device.disconnect()
     return photographs
+
+
+def chosen_frames(episode: int, length: int, frames: int) -> dict[str, int]:
+    """Return name -> index of the frames of an episode that are used, evenly spaced from its first."""
+    chosen = np.unique(np.arange(frames) * length // frames).tolist()
+    return {f"episode {episode}, frame {index}": index for index in chosen}
 
 
 def rows(source: SourceDataset, key: str, episode: int) -> Any:

@@ -184,11 +184,15 @@ def _check_alignment(config: SymviewConfig, features: Features) -> None:
         return  # views register depth
     sensor = keys.depth_intrinsics(config.seen_camera)
     size, color_size = (image_size(features, name) for name in (key, config.color_key))
-    if sensor in features or size != color_size:
-        reason = f"the dataset has {sensor}" if sensor in features else f"it has {size} pixels, colour {color_size}"
+    reasons = [f"the dataset has {sensor}"] if sensor in features else []
+    if "depth_sensor" in config.calibration.get("cameras", {}).get(config.seen_camera, {}):
+        reasons.append("--policy.calibration has a depth_sensor")
+    if size != color_size:
+        reasons.append(f"it has {size} pixels, colour {color_size}")
+    if reasons:
         raise ValueError(
-            f"--policy.method={config.method} reads {key}, which is not aligned with colour, since {reason}: choose a "
-            "method with a view, such as reproj_equi, or align depth when recording"
+            f"--policy.method={config.method} reads {key}, which is not aligned with colour, since "
+            f"{' and '.join(reasons)}: choose a method with a view, such as reproj_equi, or align depth when recording"
         )
 
 

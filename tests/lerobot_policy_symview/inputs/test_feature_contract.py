@@ -79,3 +79,14 @@ def test_methods_that_read_raw_depth_refuse_depth_that_is_not_aligned(method, ha
     reason = "the dataset has" if has_sensor else "it has"
     with pytest.raises(ValueError, match=f"--policy.method={method} reads .*not aligned with colour, since {reason}"):
         read_features(make_config(method=method), features)
+
+
+def test_methods_that_read_raw_depth_refuse_a_calibration_with_a_depth_sensor():
+    sensor = {"depth_sensor": {"intrinsics": [30, 30, 15.5, 15.5], "color_from_depth": np.eye(4).tolist()}}
+    calibration = FILE | {"cameras": {"side": FILE["cameras"]["side"] | sensor}}
+    features = {keys.rgb("side"): {"dtype": "image", "shape": (76, 76, 3)}}
+    features |= {keys.depth("side"): {"dtype": "image", "shape": (76, 76, 1), "info": {"is_depth_map": True}}}
+    vectors = {"dtype": "float32", "shape": (5,)}
+    features |= {keys.STATE: vectors | {"names": keys.STATE_NAMES}, keys.ACTION: vectors | {"names": keys.ACTION_NAMES}}
+    with pytest.raises(ValueError, match=r"not aligned with colour, since --policy\.calibration has a depth_sensor"):
+        read_features(make_config(method="sideview_equi", calibration=calibration), features)

@@ -181,3 +181,9 @@ def test_table_rays_of_the_sensor_lie_on_the_table():
     seen = register_depth(depth.astype(np.float32), camera) > 0
     assert np.abs(points[seen][:, 2]).max() < 0.03
     assert abs(np.median(points[seen][:, 2])) < 0.001
+
+
+def test_a_stored_sensor_needs_both_matrices():
+    with pytest.raises(CalibrationError, match="belong together"):
+        stored_camera(np.diag([60.0, 60, 1]) + [[0, 0, 9], [0, 0, 9], [0, 0, 0]], make_camera().world_from_cam, 20, 20,
+                      depth_intrinsics=np.eye(3))  # fmt: skip

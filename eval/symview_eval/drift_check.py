@@ -22,7 +22,7 @@ from symview_eval.calibrate.output import replace_file
 
 logger = logging.getLogger(__name__)
 
-MOST_DRIFT = 2.0  # pixels: features are found to a tenth, and a view of 152 pixels shows 2 of 640 as 1
+MOST_DRIFT = 2.0  # pixels: features are found to a tenth; a view of 152 pixels shows 2 of 640 as half a pixel
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class EpisodeDrift:
     drift: Drift
 
 
-def check_camera(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
+def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
     """Compare the first frames of all episodes, report what has moved, and write the moved camera's calibration.
 
     Args:
