@@ -26,7 +26,7 @@ ENCODERS: Registry[EncoderFactory] = Registry(
         "equivariant": f"{_CONVOLUTIONAL}:equivariant",
         "plain": f"{_CONVOLUTIONAL}:plain",
         "relaxed": f"{_CONVOLUTIONAL}:relaxed",
-        "voxel": f"{_CONVOLUTIONAL}:voxel",
+        "voxel": "lerobot_policy_symview.nn.encoders.voxel:voxel",
         "point_cloud": "lerobot_policy_symview.nn.encoders.point_cloud:point_cloud",
     },
 )

@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor, nn
@@ -23,8 +24,11 @@ from tqdm import tqdm
 
 from lerobot_policy_symview.configuration import CROP_SIZES
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.inputs.voxels import HEIGHT, SIDE, VOXEL_CHANNELS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.nn.encoders.convolutional import ImageEncoder
+from lerobot_policy_symview.nn.encoders.convolutional import ConvolutionalEncoder, ImageEncoder
+from lerobot_policy_symview.nn.encoders.voxel import VoxelEncoder
+from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
@@ -36,6 +40,7 @@ logger = logging.getLogger(__name__)
 LEROBOT = "import time, lerobot.scripts.lerobot_train, lerobot.scripts.lerobot_eval; start = time.perf_counter()"
 PLUGIN = f"{LEROBOT}; import lerobot_policy_symview; print(time.perf_counter() - start)"
 LOADED_EPISODES = 4
+VOXEL_BATCH = 8
 MARGIN = 24  # pixels between the image and its random crop: the paper crops 152 to 128
 
 
@@ -103,6 +108,18 @@ class PlainNetwork(nn.Module):
         return features.flatten(1)
 
 
+class WholeConvolutions(nn.Module):
+    """A voxel encoder whose first layers are computed at every voxel."""
+
+    def __init__(self, encoder: VoxelEncoder):
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, grid: Tensor, state: Tensor) -> Tensor:
+        """Map voxel grids and states to the encoder's features."""
+        return ConvolutionalEncoder.forward(self.encoder, grid, state)
+
+
 def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     """Time the policy and the networks it is compared with.
 
@@ -111,6 +128,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
         training step over escnn's, and over that of a plain network of the same expanded widths in its faster
         precision. `inference_ratio_b1` and `_b5`: our inference over the plain network's, for batches of 1 and 5.
         `train_step_floor_s`: the plain network's arithmetic at the rate of large matrix products in `--dtype`.
+        `voxel_train_step_ratio`: the voxel encoder's training step over that of whole convolutions, for 8 grids.
         `plugin_import_s`: time that the plugin adds to LeRobot's import. `loader_share`: time to load a batch over the
         time of a training step. Without the extra `escnn`, the entries of escnn are left out.
     """
@@ -151,6 +169,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     return results | {
         "plugin_import_s": plugin_import_seconds(),
         "construct_s": construct,
+        "voxel_train_step_ratio": voxel_ratio(config),
         "loader_s": loading,
         "loader_share": loading / steps[""],
     }
@@ -234,6 +253,18 @@ def _synchronize() -> None:
     """Wait for the GPU, if there is one: calls return before it has finished."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
+
+
+def voxel_ratio(config: PolicyBenchmark) -> float:
+    """Return the training step of the voxel encoder over that with whole convolutions, for a table with blocks."""
+    encoder = VoxelEncoder(make_group("D4"), np.zeros((8, 0, 0)), config.width).to(config.device)
+    grid = torch.zeros(VOXEL_BATCH, VOXEL_CHANNELS, HEIGHT, SIDE, SIDE, device=config.device)
+    grid[:, :, 0] = grid[:, :, 1:9, 20:29, 31:40] = grid[:, :, 1:9, 40:49, 10:19] = 1.0
+    state = torch.zeros(VOXEL_BATCH, 0, device=config.device)
+    networks = {"sparse": encoder, "whole": WholeConvolutions(encoder)}
+    calls = {name: _training_step(network, grid, state, config.dtype) for name, network in networks.items()}
+    times = _medians(calls, config.repeats, "step of voxels")
+    return times["sparse"] / times["whole"]
 
 
 def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:

@@ -203,10 +203,14 @@ class FieldConv3d(FieldLayer):
         super().__init__(group, inputs, fields, pixel_basis(group), depth)
         self.padding = padding
 
+    def filters(self) -> tuple[Tensor, Tensor]:
+        """Return ordinary filters (G fields, channels, depth, 3, 3) and biases (G fields,)."""
+        weight, bias = self.expanded()
+        return weight.view(*weight.shape[:3], 3, 3), bias
+
     def forward(self, voxels: Tensor, pool: bool = False) -> Tensor:
         """Map (B, channels, Z, H, W) to (B, G fields, Z', H', W'); `pool` appends 2 x 2 x 2 max pooling and ReLU."""
-        weight, bias = self.expanded()
-        result = functional.conv3d(voxels, weight.view(*weight.shape[:3], 3, 3), bias, padding=self.padding)
+        result = functional.conv3d(voxels, *self.filters(), padding=self.padding)
         return functional.relu(functional.max_pool3d(result, 2)) if pool else result
 
 

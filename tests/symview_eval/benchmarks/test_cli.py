@@ -88,6 +88,7 @@ def test_the_policy_benchmark_names_every_ratio(monkeypatch, capsys):
     expected = {
         "train_step_ratio_escnn_fp32",
         "train_step_ratio_plain",
+        "voxel_train_step_ratio",
         "train_step_floor_s",
         "inference_ratio_b1",
         "inference_ms_b1",

@@ -1,4 +1,4 @@
-"""Convolutional encoders of images and voxel grids.
+"""Convolutional encoders of images.
 
 The plain encoder has the layout of the equivariant encoder for the trivial group.
 """
@@ -14,10 +14,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.inputs.voxels import VOXEL_CHANNELS
 from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.nn.fourier_conv import FourierConv2d
-from lerobot_policy_symview.nn.layers import FieldConv2d, FieldConv3d, RelaxedConv2d
+from lerobot_policy_symview.nn.layers import FieldConv2d, RelaxedConv2d
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
 
 CHANNELS_LAST = {2: torch.channels_last, 3: torch.channels_last_3d}
@@ -46,11 +45,15 @@ class ConvolutionalEncoder(Encoder):
         features = torch.cat([observation, state_channels], dim=1)
         if torch.is_autocast_enabled(features.device.type) or features.is_cuda:
             features = features.contiguous(memory_format=CHANNELS_LAST[len(shape)])
-        for layer, pool in zip(self.layers, self.pooled, strict=True):
+        return self.split(self.run(features))
+
+    def run(self, features: Tensor, first: int = 0) -> Tensor:
+        """Return the features (B, G n, 1, ...) after the layers from number `first` on."""
+        for layer, pool in zip(self.layers[first:], self.pooled[first:], strict=True):
             features = layer(features, pool)
             if not pool:
                 features = functional.relu(features)
-        return self.split(features)
+        return features
 
 
 class ImageEncoder(ConvolutionalEncoder):
@@ -83,27 +86,6 @@ class ImageEncoder(ConvolutionalEncoder):
         super().__init__(group, fields[-1], layers, [True] * len(stages) + [False, True, False])
 
 
-class VoxelEncoder(ConvolutionalEncoder):
-    """The image encoder in three dimensions, for grids of 32 x 64 x 64 voxels; the group acts on the last two axes.
-
-    Args:
-        group: G elements.
-        state: (G, D, D), representation of the state vector, which is repeated at every voxel.
-        width: n of the corresponding image encoder; 64 gives 1.18 M parameters.
-    """
-
-    def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
-        fields = [width // 16, width // 8, width // 4, width // 2, width, width // 2, width // 2]
-        inputs: list[int | NDArray[np.float64]] = [with_trivial(group, VOXEL_CHANNELS, state), *fields[:-1]]
-        paddings = [(1, 1, 1)] * 5 + [(1, 0, 0), (0, 0, 0)]
-        depths = [3] * 6 + [2]
-        layers = [
-            FieldConv3d(group, before, after, padding, depth)
-            for before, after, padding, depth in zip(inputs, fields, paddings, depths, strict=True)
-        ]
-        super().__init__(group, fields[-1], layers, [True, True, True, False, False, True, False])
-
-
 def with_trivial(group: PlanarGroup, count: int, others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the direct sum of `count` trivial representations and `others` (G, D, D)."""
     return block_diagonal([np.ones((group.size, 1, 1))] * count + [others])
@@ -127,11 +109,6 @@ def plain(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64])
     stages = [2 * fields for fields in _stages(config)]
     fields = (2 * config.width, 4 * config.width, 4 * config.width)
     return ImageEncoder(group, config.channels, state, stages, fields, _unconstrained)
-
-
-def voxel(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
-    """Return the encoder of voxel grids."""
-    return VoxelEncoder(group, state, config.width)
 
 
 def _image_encoder(
