@@ -17,7 +17,7 @@ from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, gray_to_rgb
 
-INFILLS = ("nearest", "local", "none")
+INFILLS = ("nearest", "occlusion", "local", "none")
 
 
 class Reprojection(NamedTuple):
@@ -81,8 +81,9 @@ class ReprojectedView(View):
 
     size: int = 152
     """Rows and columns."""
-    infill: Literal["nearest", "local", "none"] = "nearest"
-    """Infill of pixels without a point: nearest point (the paper's best), mean of a 5 x 5 window, or none (black)."""
+    infill: Literal["nearest", "occlusion", "local", "none"] = "nearest"
+    """Infill of pixels without a point: nearest point (the paper's best); the same, but what is behind an object in its
+    shadow (occlusion); mean of a 5 x 5 window; or none (black)."""
     clip: Literal["gripper", "none"] | float = "gripper"
     """`gripper` removes points above the gripper, and with them the arm, if the gripper's state is known; `none` keeps
     all points; a number removes points above that height, metres."""
@@ -144,7 +145,7 @@ class ReprojectedView(View):
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the outputs; black and height 0 where no point was measured or infilled."""
-        from lerobot_symview.geometry import flying_pixels, infill, upsampling, zbuffer  # slow import: numba
+        from lerobot_symview.geometry import flying_pixels, infill, occlusion, upsampling, zbuffer  # slow import: numba
 
         if frame.depth is None:
             raise ValueError("the view 'reproj' needs depth; use 'persp' for a camera without depth")
@@ -158,7 +159,10 @@ class ReprojectedView(View):
             [depth], [camera], frame.workspace, self.size, self.ceiling(frame.gripper_height)
         )
         seen = buffer.source != zbuffer.EMPTY
-        shown = infill.nearest_known(seen) if self.infill == "nearest" else _identity_cells(self.size)
+        is_nearest = self.infill in ("nearest", "occlusion")
+        shown = infill.nearest_known(seen) if is_nearest else _identity_cells(self.size)
+        if self.infill == "occlusion":
+            shown = occlusion.without_smear(shown, buffer, depth, camera, frame.workspace)
         colors, height = zbuffer.gather(shown, buffer, rgb.reshape(-1, 3))
         if self.infill == "local":
             colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)

@@ -70,9 +70,9 @@ class FrameBatch:
 
 
 def can_batch(view: View) -> bool:
-    """Whether `render_batch` supports this view: not `local` infill, `source_scale` above 1, or third-party views."""
+    """Whether `render_batch` supports this view: infill `nearest` or `none`, `source_scale` 1, no third-party views."""
     if isinstance(view, ReprojectedView):
-        return view.infill != "local" and view.source_scale == 1
+        return view.infill in ("nearest", "none") and view.source_scale == 1
     return isinstance(view, PerspectiveView)
 
 

@@ -42,6 +42,7 @@ RECORDED = 25  # recorded episodes, repeated to fill the offline dataset
 VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
     "reproject_none": ("reproj", {"infill": "none"}),
+    "reproject_occlusion": ("reproj", {"infill": "occlusion"}),
     "reproject_local": ("reproj", {"infill": "local"}),
     "reproject_scale_2": ("reproj", {"source_scale": 2}),
     "perspective": ("persp", {"gripper": False}),

@@ -41,12 +41,15 @@ def test_result_paths_are_unique(name):
     assert len({cell.path for cell in chosen}) == len(chosen)
 
 
+OWN_ROWS = {"reproj_equi_occlusion"}  # in a table of the paper's, but not in the paper
+
+
 @pytest.mark.parametrize("name", [name for name in EXPERIMENTS if paper_values(name)])
 def test_every_row_has_a_paper_value(name):
     in_paper = set(paper_values(name))
     in_table = {(cell.task, cell.demonstrations, cell.row.name) for cell in cells(name, seeds=[0])}
     missing = {("block_stacking", 50, "voxel_equi")} if name == "table1" else set()  # the paper prints a dash
-    assert in_paper == in_table - missing
+    assert in_paper == {cell for cell in in_table - missing if cell[2] not in OWN_ROWS}
 
 
 def test_paper_values():
