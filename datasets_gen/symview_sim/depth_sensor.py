@@ -1,4 +1,4 @@
-"""Noise and missing pixels of a stereo depth camera, added to exact depth."""
+"""Noise, missing and flying pixels of a stereo depth camera, added to exact depth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ JUMP = 0.02  # metres between neighbouring pixels: a depth discontinuity
 EDGE_FACTOR = 10.0
 
 
-def degrade(depth: NDArray[np.float32], noise: float, dropout: float, rng: np.random.Generator) -> NDArray[np.float32]:
+def degrade(
+    depth: NDArray[np.float32], noise: float, dropout: float, rng: np.random.Generator, flying: float = 0.0
+) -> NDArray[np.float32]:
     """Return the depth that a stereo camera would measure.
 
     Disparity is f B / z and has the same error, in pixels, everywhere. The depth error therefore grows with z^2
@@ -20,10 +22,13 @@ def degrade(depth: NDArray[np.float32], noise: float, dropout: float, rng: np.ra
         noise: standard deviation at 1 m, metres.
         dropout: share of pixels without depth, ten times as large beside a discontinuity of 2 cm or more.
         rng: source of randomness.
+        flying: share of the pixels beside a discontinuity whose depth lies between those of the two surfaces.
 
     Returns:
         (H, W) float32, metres, 0 = invalid.
     """
+    if flying > 0:
+        depth = _with_flying_pixels(depth, flying, rng)
     measured = depth + noise * depth**2 * rng.standard_normal(depth.shape)
     if dropout > 0:
         lost = rng.random(depth.shape)
@@ -42,3 +47,12 @@ def _beside_discontinuities(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
         beside[tuple(first)] |= jump
         beside[tuple(second)] |= jump
     return beside
+
+
+def _with_flying_pixels(depth: NDArray[np.float32], share: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Return depth in which some pixels beside a discontinuity have a depth between their neighbours'."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(depth, 1, mode="edge"), (3, 3))
+    nearest, farthest = around.min(axis=(2, 3)), around.max(axis=(2, 3))
+    flies = _beside_discontinuities(depth) & (nearest > 0) & (rng.random(depth.shape) < share)
+    weight = rng.random(depth.shape, dtype=np.float32)
+    return np.where(flies, nearest + weight * (farthest - nearest), depth)

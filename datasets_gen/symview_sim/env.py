@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from contextlib import nullcontext
 from typing import Any
 
@@ -65,6 +66,8 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self._robot = lookup("robot", settings.robot, ROBOTS)
         self.specs = settings.all_cameras
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
+        self._stated = dict(self.cameras)  # as their calibration, which may be wrong, states them
+        self._recent: dict[str, deque[CameraImages]] = {}
         self._placed = False
         self._scene: Scene | None = None
         self._steps = 0
@@ -94,10 +97,16 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
         self.episode_task.spawn(self.scene, self.np_random)
         self.scene.settle()
-        pose_rng, self._sensor_rng = self.np_random.spawn(2)  # cameras do not change the physics
+        # cameras do not change the physics
+        pose_rng, self._sensor_rng, calibration_rng = self.np_random.spawn(3)
         for spec in self.specs:
             if spec.varies or not self._placed:
                 self.cameras[spec.name] = place_in_sight(spec, self.scene.client, self.workspace, pose_rng)
+            camera = self.cameras[spec.name]
+            self._stated[spec.name] = (
+                spec.miscalibration.stated(camera, calibration_rng) if spec.miscalibration else camera
+            )
+            self._recent[spec.name] = deque(maxlen=spec.delay + 1)
         self._placed = True
         return self._observe(), {"is_success": False}
 
@@ -139,8 +148,9 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
             "pixels": {},
         }
         for spec in self.specs:
-            name, camera = spec.name, self.cameras[spec.name]
-            image = self._render(spec)
+            name, camera = spec.name, self._stated[spec.name]
+            self._recent[name].append(self._render(spec))
+            image = self._recent[name][0]
             observation["pixels"][name] = image.rgb
             if self.settings.depth:
                 observation[_env_key(keys.depth(name))] = image.depth[None]
@@ -156,9 +166,10 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         camera = self.cameras[spec.name]
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
             image = render(self.scene.client, camera, labelled=self.settings.segmentation)
-        if spec.depth_noise == spec.depth_dropout == 0:
+        if spec.depth_noise == spec.depth_dropout == spec.flying_pixels == 0:
             return image
-        return image._replace(depth=degrade(image.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng))
+        depth = degrade(image.depth, spec.depth_noise, spec.depth_dropout, self._sensor_rng, spec.flying_pixels)
+        return image._replace(depth=depth)
 
 
 def make_env(render_mode: str | None = "rgb_array", **options: Any) -> SymviewEnv:

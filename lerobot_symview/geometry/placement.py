@@ -8,11 +8,13 @@ import numpy as np
 
 from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Array, Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.miscalibration import Miscalibration
 from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
 from lerobot_symview.geometry.workspace import Workspace
 
 TOP_DISTANCE = 8.0  # metres: at this distance perspective shifts the top of a 5 cm block by less than a millimetre
 TRIES = 100
+MAX_DELAY = 100  # actions, whose images are kept
 Vector = tuple[float, float, float]
 
 
@@ -40,7 +42,7 @@ class CameraSpread:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole camera over the workspace, and the noise of its depth sensor.
+    """A pinhole camera over the workspace, and the errors of its depth, its timing and its calibration.
 
     Raises:
         OptionError: if values are invalid; the message lists them all.
@@ -75,6 +77,12 @@ class CameraSpec:
     depth_dropout: float = 0.0
     """Fraction of pixels without depth. It is ten times as large beside depth discontinuities, where one of a stereo
     camera's two sensors is occluded."""
+    flying_pixels: float = 0.0
+    """Fraction of the pixels beside depth discontinuities that measure a depth between the two surfaces."""
+    delay: int = 0
+    """Actions by which images are late; the state is not."""
+    miscalibration: Miscalibration = field(default_factory=Miscalibration)
+    """Error of the calibration that observations state."""
 
     def __post_init__(self) -> None:
         problems = []
@@ -102,6 +110,10 @@ class CameraSpec:
             problems.append(f"depth_noise must not be negative, got {self.depth_noise:g}")
         if not 0 <= self.depth_dropout <= 1:
             problems.append(f"depth_dropout must lie in [0, 1], got {self.depth_dropout:g}")
+        if not 0 <= self.flying_pixels <= 1:
+            problems.append(f"flying_pixels must lie in [0, 1], got {self.flying_pixels:g}")
+        if not 0 <= self.delay <= MAX_DELAY:
+            problems.append(f"delay must be 0 to {MAX_DELAY} actions, got {self.delay}")
         if problems:
             raise OptionError(f"camera {self.name!r}: {'; '.join(problems)}")
 

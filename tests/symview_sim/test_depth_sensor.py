@@ -30,3 +30,16 @@ def test_dropout_is_ten_times_as_frequent_beside_a_discontinuity():
 def test_invalid_depth_stays_invalid():
     depth = np.zeros((20, 20), dtype=np.float32)
     assert not degrade(depth, noise=0.1, dropout=0.1, rng=np.random.default_rng(0)).any()
+
+
+def test_flying_pixels_lie_between_the_surfaces_at_a_discontinuity():
+    depth = np.full((300, 300), 1.0, dtype=np.float32)
+    depth[:, 150:] = 0.9
+    depth[:10] = 0
+    measured = degrade(depth, noise=0.0, dropout=0.0, rng=np.random.default_rng(0), flying=0.5)
+    changed = measured != depth
+    assert not changed[:, :149].any()
+    assert not changed[:, 151:].any()
+    assert not changed[:11].any()  # nothing flies before the horizon
+    assert changed[11:, 149:151].mean() == pytest.approx(0.5, abs=0.06)
+    assert ((measured[changed] > 0.9) & (measured[changed] < 1.0)).all()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from lerobot_symview.geometry.miscalibration import Miscalibration
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from symview_sim import TASK_NAMES, gym_id
 from symview_sim.demonstration import episode_seed
@@ -125,6 +126,40 @@ def test_depth_noise_changes_only_the_depth_and_differs_in_every_frame():
     assert 0.0 < np.abs(error[depths[1][0] > 0]).max() < 0.02
     assert 0.01 < (depths[1][0] == 0).mean() < 0.2
     assert not np.array_equal(depths[1][0], depths[1][1])
+
+
+def test_a_wrong_calibration_is_stated_anew_in_every_episode_and_changes_no_image():
+    wrong = replace(SIDE, miscalibration=Miscalibration(position=0.02, rotation_deg=3.0, focal=0.01))
+    exact, env = (EnvSettings("block_picking", camera=camera).make() for camera in (SIDE, wrong))
+    stated = []
+    for seed in range(2):
+        expected, actual = exact.reset(seed=seed)[0], env.reset(seed=seed)[0]
+        np.testing.assert_array_equal(actual["pixels"]["side"], expected["pixels"]["side"])
+        np.testing.assert_array_equal(actual["images.side_depth"], expected["images.side_depth"])
+        poses = [found["camera.side.world_from_cam"].reshape(4, 4) for found in (expected, actual)]
+        assert np.linalg.norm(poses[1][:3, 3] - poses[0][:3, 3]) == pytest.approx(0.02, abs=1e-5)
+        stated.append(poses[1])
+        after = env.step(env.expert_action())[0]
+        np.testing.assert_array_equal(after["camera.side.world_from_cam"].reshape(4, 4), poses[1])
+    assert not np.allclose(*stated)
+
+
+def test_late_images_are_those_of_earlier_actions():
+    prompt, late = (EnvSettings("block_picking", camera=replace(SIDE, delay=delay)).make() for delay in (0, 2))
+    observations = []
+    for env in (prompt, late):
+        seen = [env.reset(seed=0)[0]]
+        for _ in range(4):
+            seen.append(env.step(np.array([0, 0, -0.03, 0, 1], dtype=np.float32))[0])
+        observations.append(seen)
+    for step, observation in enumerate(observations[1]):
+        earlier = observations[0][max(step - 2, 0)]
+        np.testing.assert_array_equal(observation["pixels"]["side"], earlier["pixels"]["side"])
+        np.testing.assert_array_equal(observation["images.side_depth"], earlier["images.side_depth"])
+        np.testing.assert_array_equal(observation["agent_pos"], observations[0][step]["agent_pos"])
+    assert not np.array_equal(observations[0][0]["pixels"]["side"], observations[0][2]["pixels"]["side"])
+    again = late.reset(seed=0)[0]
+    np.testing.assert_array_equal(again["pixels"]["side"], observations[0][0]["pixels"]["side"])
 
 
 def test_a_distant_camera_renders_arm_and_objects():

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_policy_symview.methods import METHODS
+from lerobot_symview.geometry.miscalibration import Miscalibration
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.registry import lookup
 from lerobot_symview.views import ViewSpec
@@ -171,6 +172,10 @@ ABLATION_TASKS = ("drawer_opening", "block_stacking", "block_in_bowl")
 ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
 
 
+def _miscalibrated(**errors: float) -> CameraSpec:
+    return CameraSpec(miscalibration=Miscalibration(**errors))
+
+
 def _at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
     camera = CameraSpec(elevation_deg=elevation_deg)
     return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
@@ -188,6 +193,20 @@ PLACEMENTS = (
     ("distance 1.1 m", CameraSpec(distance=1.1)),
     ("field of view 60°", CameraSpec(fov_deg=60.0)),
     ("new in every episode", CameraSpec(spread=ANYWHERE)),
+)
+
+
+WITH_ERRORS = (REPROJ, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
+SENSORS = (
+    ("exact", CameraSpec()),
+    *((f"position {100 * metres:g} cm", _miscalibrated(position=metres)) for metres in (0.005, 0.01, 0.02, 0.03)),
+    *((f"rotation {degrees:g}°", _miscalibrated(rotation_deg=degrees)) for degrees in (0.5, 1.0, 2.0, 5.0)),
+    ("1 cm and 1°", _miscalibrated(position=0.01, rotation_deg=1.0)),
+    *((f"focal length {100 * error:g} %", _miscalibrated(focal=error)) for error in (0.01, 0.025, 0.05)),
+    *((f"depth noise {1000 * metres:g} mm", CameraSpec(depth_noise=metres)) for metres in (0.001, 0.0025, 0.005)),
+    *((f"depth dropout {100 * share:g} %", CameraSpec(depth_dropout=share)) for share in (0.01, 0.1)),
+    ("flying pixels 50 %", CameraSpec(flying_pixels=0.5)),
+    ("late by an action", CameraSpec(delay=1)),
 )
 
 
@@ -278,6 +297,14 @@ EXPERIMENTS = {
             CLONED_TASKS,
             (10,),
             placements=PLACEMENTS,
+        ),
+        Experiment(
+            "robustness",
+            "Errors of the camera that the training did not have",
+            WITH_ERRORS,
+            CLONED_TASKS,
+            (10,),
+            placements=SENSORS,
         ),
         Experiment(
             "figure7",

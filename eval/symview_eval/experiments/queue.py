@@ -95,14 +95,14 @@ def chosen_cells(
 
 
 def _rank(cell: Cell) -> int:
-    """Return how soon a cell is run: tables 1 and 2 at 10 demonstrations, the ablations, then figures and transfer."""
+    """Return how soon a cell is run: tables 1 and 2 at 10 demonstrations, ablations, figures and cameras, the rest."""
     if cell.experiment in ("table1", "table2") and cell.demonstrations == 10:
         return 0
     if cell.experiment in ("table3", "table4", "table5") and cell.seed < 2:
         return 1
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
         return 2
-    if cell.experiment == "transfer" and cell.task in TRANSFER_TASKS:
+    if cell.experiment in ("transfer", "robustness") and cell.task in TRANSFER_TASKS:
         return 2
     return 3
 
