@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from tqdm import tqdm
 
-from lerobot_symview.calibration.drift import Drift, image_drift, moved_camera
+from lerobot_symview.calibration.drift import MOST_DRIFT, Drift, image_drift, moved_camera
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.table_plane import has_depth, levelled
 from lerobot_symview.datasets.frame_reader import FrameReader
@@ -21,8 +21,6 @@ from lerobot_symview.views import Frame
 from symview_eval.calibrate.output import replace_file
 
 logger = logging.getLogger(__name__)
-
-MOST_DRIFT = 2.0  # pixels: features are found to a tenth; a view of 152 pixels shows 2 of 640 as half a pixel
 
 
 @dataclass(frozen=True)

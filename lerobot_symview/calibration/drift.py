@@ -17,6 +17,7 @@ ROUND_TRIP = 0.5  # pixels between a feature and itself, tracked forth and back
 CONSENSUS = 1.5  # pixels: features that move with the image, not with objects or the arm
 FEWEST, LEAST_SHARE = 20, 0.5  # of features that agree; below, an image tells nothing
 PNP_ERROR = 2.0  # pixels
+MOST_DRIFT = 2.0  # pixels: features are found to a tenth; a view of 152 pixels shows 2 of 640 as half a pixel
 
 
 @dataclass(frozen=True, eq=False)

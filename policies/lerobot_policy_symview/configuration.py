@@ -108,6 +108,10 @@ class SymviewConfig(PreTrainedConfig):
     """Content of a calibration file, for observations without calibration; read from a dataset whose camera never
     moved."""
 
+    check_camera: bool = False
+    """Keep the camera's first image of the demonstrations, and compare the first observation with it: warn of a camera
+    that was moved, and do not act on an image that shows something else. For a camera with one calibration."""
+
     # The policy scales states and actions itself, in a way that commutes with the group; per-axis statistics do not.
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION", "ENV"), NormalizationMode.IDENTITY)

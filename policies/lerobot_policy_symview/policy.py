@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.encoders import make_encoder
+from lerobot_policy_symview.inputs.camera_check import REFERENCE, check_image, reference_image, with_reference
 from lerobot_policy_symview.inputs.feature_contract import read_calibration
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
@@ -82,6 +83,7 @@ class SymviewPolicy(PreTrainedPolicy):
     action_width: Tensor
     state_center: Tensor
     state_width: Tensor
+    reference_image: Tensor
 
     def __init__(self, config: SymviewConfig, make_head: MakeHead, dataset_stats: dict[str, dict[str, Any]] | None):
         super().__init__(config)
@@ -99,6 +101,9 @@ class SymviewPolicy(PreTrainedPolicy):
         for name, (center, width) in {"action": action, "state": state}.items():
             self.register_buffer(f"{name}_center", center)
             self.register_buffer(f"{name}_width", width)
+        if config.check_camera:
+            self.register_buffer(REFERENCE, reference_image(config))
+        self._is_camera_checked = False
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
@@ -124,11 +129,16 @@ class SymviewPolicy(PreTrainedPolicy):
         return policy
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load weights; averaged weights that `state_dict` lacks are initialised with the trained ones."""
+        """Load weights; averaged weights that `state_dict` lacks are initialised with the trained ones.
+
+        Raises:
+            ValueError: if `check_camera` is on and there is no image of the demonstrations.
+        """
         if self.averaged is not None and not any(name.startswith("averaged.") for name in state_dict):
             trained = {name for name in state_dict if name.startswith("network.")}
             initial = {name.replace("network.", "averaged.", 1): state_dict[name].clone() for name in trained}
             state_dict = {**state_dict, **initial}
+        state_dict = with_reference(state_dict, self.reference_image if self.config.check_camera else None)
         return super().load_state_dict(state_dict, strict, assign)
 
     @abstractmethod
@@ -181,8 +191,12 @@ class SymviewPolicy(PreTrainedPolicy):
 
         Raises:
             DivergenceError: if it is not finite; an exported policy does not check it.
+            CalibrationError: with `check_camera`, if the first image shows something else than the demonstrations.
         """
         self.eval()
+        if self.config.check_camera and not (self._is_camera_checked or is_exporting()):
+            check_image(self.config, self.reference_image, self.scene.own_names(batch))
+            self._is_camera_checked = True
         with self.precision():
             scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
         action = self.physical(scaled)

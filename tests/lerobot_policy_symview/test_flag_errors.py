@@ -45,6 +45,7 @@ WRONG = {
         "action_symmetry": (["height"], r"--policy.action_symmetry has unknown types \['height'\], expected any of"),
         "workspace": ({"size": -1}, "--policy.workspace: workspace size and height_limit must be positive.*got -1"),
         "calibration": ({"units": "cm"}, "--policy.calibration: units must be m or mm, got 'cm'"),
+        "check_camera": ("perhaps", "check_camera.*'perhaps'"),
         "normalization_mapping": ({"STATE": "MIN_MAX"}, "--policy.normalization_mapping must be IDENTITY for STATE"),
         "learning_rate_decay": ("linear", "learning_rate_decay.*'linear'.*cosine"),
         "aperture_noise": (NAN, "--policy.aperture_noise must be finite and at least 0, got nan"),
