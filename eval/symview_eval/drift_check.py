@@ -1,4 +1,7 @@
-"""`symview-preview --check`: whether a dataset's camera was moved between its episodes, and where it stands now."""
+"""`symview-preview --check`: whether a dataset's camera was moved between its episodes, and where it stands now.
+
+`--check_image` compares an image that the camera takes now.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from lerobot_symview.calibration.drift import MOST_DRIFT, Drift, image_drift, moved_camera
@@ -19,6 +23,7 @@ from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.visibility import table_resolution
 from lerobot_symview.views import Frame
 from symview_eval.calibrate.output import replace_file
+from symview_eval.calibrate.photographs import from_files
 
 logger = logging.getLogger(__name__)
 
@@ -51,10 +56,7 @@ def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
         logger.info("camera %r: every episode has a calibration of its own, there is nothing to compare", reader.camera)
         return measured
     farthest = max(measured, key=lambda one: one.drift.pixels)
-    resolution = table_resolution(farthest.frame.camera, reader.workspace)
-    length = f"{farthest.drift.pixels:.1f} pixels"
-    if resolution > 0:
-        length += f" (up to {farthest.drift.pixels / resolution:.1f} mm on the table)"
+    length = _length(reader, farthest.frame, farthest.drift)
     if not moved:
         logger.info(
             "camera %r stands still: its image moves by at most %s in %d episodes",
@@ -74,8 +76,49 @@ def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
         MOST_DRIFT,
         episodes,
     )
-    _write_moved(reader, moved[-1], output_dir)
+    last = moved[-1]
+    label, now = f"episode {last.episode}", reader.frame(last.episode, 0)
+    _write_moved(reader, last.frame, last.drift, label, now.depth, output_dir)
     return measured
+
+
+def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
+    """Compare an image that the camera takes now with the dataset's last episode, and report whether it has moved.
+
+    Args:
+        reader: of the camera's frames.
+        file: the image.
+        output_dir: folder for `cameras.yaml`, written only if the camera was moved.
+
+    Raises:
+        CalibrationError: if the file is no image, or shows something else.
+    """
+    ((name, image),) = from_files(str(file)).items()
+    episode = len(reader.dataset.episodes) - 1
+    frame = reader.frame(episode, 0)
+    try:
+        drift = image_drift(frame.rgb, image)
+    except CalibrationError as error:
+        raise CalibrationError(f"{file} cannot be compared with episode {episode}: {error}") from None
+    length = _length(reader, frame, drift)
+    if drift.pixels <= MOST_DRIFT:
+        logger.info("camera %r stands still: in %s its image has moved by %s", reader.camera, name, length)
+        return drift
+    logger.warning(
+        "camera %r was moved since episode %d: in %s its image by %s. Views of new images are displaced",
+        reader.camera,
+        episode,
+        name,
+        length,
+    )
+    _write_moved(reader, frame, drift, name, None, output_dir)
+    return drift
+
+
+def _length(reader: FrameReader, frame: Frame, drift: Drift) -> str:
+    resolution = table_resolution(frame.camera, reader.workspace)
+    on_table = f" (up to {drift.pixels / resolution:.1f} mm on the table)" if resolution > 0 else ""
+    return f"{drift.pixels:.1f} pixels{on_table}"
 
 
 def _measured(reader: FrameReader) -> list[EpisodeDrift]:
@@ -93,28 +136,34 @@ def _measured(reader: FrameReader) -> list[EpisodeDrift]:
     return measured
 
 
-def _write_moved(reader: FrameReader, moved: EpisodeDrift, output_dir: Path) -> None:
+def _write_moved(
+    reader: FrameReader,
+    reference: Frame,
+    drift: Drift,
+    label: str,
+    depth_now: NDArray[np.floating] | None,
+    output_dir: Path,
+) -> None:
     try:
-        camera = moved_camera(moved.frame.camera, moved.drift, moved.frame.depth)
+        camera = moved_camera(reference.camera, drift, reference.depth)
     except CalibrationError as error:
-        logger.warning("episode %d: %s", moved.episode, error)
+        logger.warning("%s: %s", label, error)
         return
-    difference = moved.frame.camera.cam_from_world @ camera.world_from_cam
+    difference = reference.camera.cam_from_world @ camera.world_from_cam
     degrees = np.rad2deg(np.arccos(np.clip((np.trace(difference[:3, :3]) - 1) / 2, -1, 1)))
-    frame = reader.frame(moved.episode, 0)
     plane = ""
-    if frame.depth is not None and has_depth(frame.depth, camera, reader.workspace):
+    if depth_now is not None and has_depth(depth_now, camera, reader.workspace):
         try:
-            plane = f"; with it, in the depth image, {levelled(frame.depth, camera, reader.workspace)[1]}"
+            plane = f"; with it, in the depth image, {levelled(depth_now, camera, reader.workspace)[1]}"
         except CalibrationError as error:
             plane = f"; {error}"
     file = output_dir / "cameras.yaml"
     calibration = Calibration({reader.camera: camera}, reader.workspace)
     replace_file(file, yaml.safe_dump(plain_calibration(calibration), sort_keys=False, default_flow_style=None))
     logger.info(
-        "wrote %s: the camera as it stands in episode %d, turned by %.2f degrees and shifted by %.1f mm%s",
+        "wrote %s: the camera as it stands in %s, turned by %.2f degrees and shifted by %.1f mm%s",
         file,
-        moved.episode,
+        label,
         degrees,
         1000 * np.linalg.norm(difference[:3, 3]),
         plane,

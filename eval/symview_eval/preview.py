@@ -30,7 +30,7 @@ from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, 
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
-from symview_eval.drift_check import check_drift
+from symview_eval.drift_check import check_drift, check_image
 from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
@@ -39,7 +39,8 @@ EXAMPLES = """\
   symview-preview --dataset.repo_id=me/picking
   symview-preview --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --episodes='[0, 7]' \\
       --reproj.source_scale=2 --output_dir=preview
-  symview-preview --dataset.repo_id=me/real --camera=front --check=true"""
+  symview-preview --dataset.repo_id=me/real --camera=front --check=true
+  symview-preview --dataset.repo_id=me/real --camera=front --check_image=now.png"""
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,9 @@ class PreviewConfig:
     check: bool = False
     """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
     the camera as it stands in the last of them."""
+    check_image: Path | None = None
+    """An image that the camera takes now, such as one of `lerobot-find-cameras`: warn if the camera was moved since the
+    last episode, and write `cameras.yaml`."""
     max_holes: float = 0.5
     """Fraction of a reprojected view's pixels that may be inferred before a warning is given."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
@@ -96,6 +100,8 @@ class PreviewConfig:
             raise ValueError(f"--frames must be at least 1, got {self.frames}")
         if not self.episodes:
             raise ValueError("--episodes is empty: give at least one, such as --episodes='[0]'")
+        if self.check_image is not None and not self.check_image.expanduser().is_file():
+            raise ValueError(f"--check_image must be an image file, got {self.check_image}")
         if not 0 <= self.max_holes <= 1:
             raise ValueError(f"--max_holes must lie in [0, 1], got {self.max_holes}")
         unit_from_flag(self.depth_unit)
@@ -160,8 +166,8 @@ def preview(config: PreviewConfig) -> Path:
     if unknown:
         raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0 to {total - 1}")
     reader, views = _chosen(config, source)
-    if config.check and reader is None:
-        raise ValueError("--check needs the camera's images: the dataset has views only")
+    if (config.check or config.check_image) and reader is None:
+        raise ValueError("--check and --check_image need the camera's images: the dataset has views only")
     config.output_dir.mkdir(parents=True, exist_ok=True)
     recording = None
     if config.rerun and reader is not None:
@@ -193,6 +199,9 @@ def preview(config: PreviewConfig) -> Path:
     if reader is not None:
         if config.check:
             check_drift(reader, config.output_dir)
+        if config.check_image is not None:
+            with flagged("--check_image"):
+                check_image(reader, config.check_image, config.output_dir)
         with flagged(f"--camera={config.camera}, --calibration, --depth_unit"):
             check_calibration(reader)
     return config.output_dir

@@ -11,7 +11,7 @@ from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
-from lerobot_symview.errors import SymviewError
+from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.geometry.visibility import table_resolution
@@ -207,5 +207,38 @@ def test_a_camera_of_another_pose_in_every_episode_is_not_compared(tmp_path, cap
 
 
 def test_a_dataset_of_views_alone_cannot_be_checked(only_views, tmp_path):
-    with pytest.raises(ValueError, match="--check needs the camera's images"):
+    with pytest.raises(ValueError, match="--check and --check_image need the camera's images"):
         preview(config(only_views, tmp_path, check=True))
+
+
+def test_an_image_of_today_tells_whether_the_camera_was_moved(tmp_path, caplog):
+    folder, file, before = record_moving(tmp_path, [0, 0])
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, np.arctan(4 / K[0, 0]), 0.0]))[0]
+    images = {
+        "same.png": textured_table(before, seed=7),
+        "moved.png": textured_table(Camera(K, before.world_from_cam @ turn, 480, 640), seed=8),
+        "black.png": np.zeros((480, 640, 3), np.uint8),
+    }
+    written = tmp_path / "out" / "cameras.yaml"
+    for name, image in images.items():
+        cv2.imwrite(str(tmp_path / name), image[..., ::-1])
+    options = {"camera": "front", "calibration": file}
+
+    def check(name):
+        caplog.clear()
+        with caplog.at_level(logging.INFO):
+            preview(config(folder, tmp_path / "out", check_image=tmp_path / name, **options))
+        return caplog.text
+
+    still = re.compile(r"camera 'front' stands still: in same\.png its image has moved by 0\.\d pixels")
+    moved = re.compile(r"was moved since episode 1: in moved\.png its image by (3\.[7-9]|4\.[0-4]) pixels")
+    assert still.search(check("same.png"))
+    assert not written.exists()
+    assert moved.search(check("moved.png"))
+    now = read_calibration(written).camera("front")
+    assert pose_errors(before, now.world_from_cam)[0] == pytest.approx(np.rad2deg(np.arctan(4 / K[0, 0])), abs=0.05)
+    with pytest.raises(CalibrationError, match=r"--check_image: .*black\.png cannot be compared with episode 1"):
+        check("black.png")
+    with pytest.raises(ValueError, match=r"--check_image must be an image file, got .*missing\.png"):
+        config(folder, tmp_path, check_image=tmp_path / "missing.png")
