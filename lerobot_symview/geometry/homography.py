@@ -88,6 +88,31 @@ def warp_plane(rgb: NDArray[np.uint8], image_from_topdown: WarpMap) -> NDArray[n
     return np.asarray(cv2.remap(rgb, *image_from_topdown, cv2.INTER_LINEAR), dtype=np.uint8)
 
 
+def inside_image(image_from_topdown: WarpMap, camera: Camera) -> NDArray[np.bool_]:
+    """Return (pixels, pixels) bool, which pixels of a top-down image lie within the camera's image."""
+    u, v = image_from_topdown.whole[..., 0], image_from_topdown.whole[..., 1]
+    return (u >= 0) & (v >= 0) & (u < camera.width - 1) & (v < camera.height - 1)
+
+
+@lru_cache(maxsize=64)
+def pixel_density(camera: Camera, workspace: Workspace, pixels: int) -> NDArray[np.float32]:
+    """Return how many of a camera's pixels show a square metre of the table, at every pixel of a top-down image.
+
+    It is the Jacobian determinant of the table's homography, fx fy h / d^3, for a camera at the height h that sees the
+    place at the depth d along its optical axis: it grows with resolution and angle, and falls with distance.
+
+    Returns:
+        (pixels, pixels) float32; 0 behind the camera.
+    """
+    rows, columns = np.meshgrid(np.arange(pixels), np.arange(pixels), indexing="ij")
+    xy = workspace.xy_from_pixel(np.stack([rows, columns], axis=-1), pixels)
+    axis = camera.cam_from_world[2]
+    depth = xy @ axis[:2] + axis[3]
+    with np.errstate(divide="ignore"):
+        density = camera.fx * camera.fy * camera.position[2] / depth**3
+    return np.where(depth > 0, density, 0.0).astype(np.float32)
+
+
 def camera_direction(camera: Camera, workspace: Workspace) -> Array:
     """Return the horizontal unit vector (2,) from the workspace centre to the camera; zero if the camera is above it.
 

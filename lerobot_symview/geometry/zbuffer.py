@@ -88,21 +88,24 @@ def zbuffer_from_depth(
 
 
 def gather(
-    shown: NDArray[np.int32], buffer: ZBuffer, colors: NDArray[np.uint8]
+    shown: NDArray[np.int32], buffer: ZBuffer, images: Sequence[NDArray[np.uint8]]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Look up the colour and height that each pixel shows.
 
     Args:
         shown: (P, P) int32, row-major index of the cell that each pixel shows; -1 for none.
         buffer: the z-buffer.
-        colors: (N, 3) uint8, colour of every source.
+        images: (H, W, 3) uint8 each, whose pixels, counted over all images in order, are the sources.
 
     Returns:
         (P, P, 3) uint8 colours and (P, P) float32 heights; black and 0 where no point is shown.
     """
     rgb = np.zeros((*shown.shape, 3), dtype=np.uint8)
     height = np.zeros(shown.shape, dtype=np.float32)
-    _gather(shown, buffer.height, buffer.source, colors, rgb, height)
+    first = 0
+    for image in images:
+        _gather(shown, buffer.height, buffer.source, np.ascontiguousarray(image), first, rgb, height)
+        first += image.shape[0] * image.shape[1]
     return rgb, height
 
 
@@ -193,13 +196,14 @@ def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, first, height
 
 
 @njit(cache=True, nogil=True)
-def _gather(shown, heights, sources, colors, rgb, height):  # type: ignore[no-untyped-def]
+def _gather(shown, heights, sources, colors, first, rgb, height):  # type: ignore[no-untyped-def]
     shown, heights, sources = shown.ravel(), heights.ravel(), sources.ravel()
     colors, rgb, height = colors.ravel(), rgb.ravel(), height.ravel()
     for pixel in range(len(shown)):
         cell = shown[pixel]
-        if cell >= 0 and sources[cell] >= 0:
-            height[pixel] = heights[cell]
-            color = 3 * sources[cell]
-            for channel in range(3):
-                rgb[3 * pixel + channel] = colors[color + channel]
+        if cell >= 0:
+            color = 3 * (sources[cell] - first)
+            if color >= 0 and color < len(colors):
+                height[pixel] = heights[cell]
+                for channel in range(3):
+                    rgb[3 * pixel + channel] = colors[color + channel]

@@ -43,9 +43,11 @@ class Frame:
         workspace: the square on the table that views show.
         gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture in
             [0, 1]; None if unknown: then no point is clipped and no gripper image is drawn.
+        others: frames of further cameras at the same time step, over the same workspace; their gripper is not used.
 
     Raises:
-        ValueError: if an image's shape or dtype is wrong, or the gripper's state is not finite.
+        ValueError: if an image's shape or dtype is wrong, the gripper's state is not finite, or another frame has
+            another workspace.
         CalibrationError: if the camera is below the table.
     """
 
@@ -54,6 +56,7 @@ class Frame:
     camera: Camera
     workspace: Workspace
     gripper: NDArray[np.floating] | None = None
+    others: tuple[Frame, ...] = ()
 
     def __post_init__(self) -> None:
         check_above_table(self.camera)
@@ -67,6 +70,8 @@ class Frame:
             )
         if self.gripper is not None:
             check_gripper(self.gripper.tolist())
+        if any(other.workspace != self.workspace for other in self.others):
+            raise ValueError("the frames of several cameras must have one workspace")
 
     @property
     def gripper_height(self) -> float | None:

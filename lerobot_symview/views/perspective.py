@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -11,15 +12,22 @@ from numpy.typing import NDArray
 
 from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
-from lerobot_symview.geometry.homography import warp_map, warp_plane
+from lerobot_symview.geometry.homography import inside_image, pixel_density, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views.base import Frame, Kind, View, check_size, gray_to_rgb
 
 
 def warp_table(
-    rgb: NDArray[np.uint8], camera: Camera, workspace: Workspace, size: int = 152, plane_height: float = 0.0
+    rgb: NDArray[np.uint8] | Sequence[NDArray[np.uint8]],
+    camera: Camera | Sequence[Camera],
+    workspace: Workspace,
+    size: int = 152,
+    plane_height: float = 0.0,
 ) -> NDArray[np.uint8]:
     """Warp an RGB image to a top-down view of the table's plane (paper section 4.2).
+
+    The first two arguments may be lists, of several cameras: each pixel then shows the camera with the most pixels of
+    that part of the table.
 
     Args:
         rgb: (H, W, 3) uint8.
@@ -32,10 +40,14 @@ def warp_table(
         (size, size, 3) uint8; rows grow with the world's x, columns with y; black outside the camera's image.
 
     Raises:
-        ValueError: if the image's shape or dtype is wrong, or the plane lies partly behind the camera.
+        ValueError: if an image's shape or dtype is wrong, the plane lies partly behind a camera, or lists differ in
+            length.
     """
     view = PerspectiveView(size=size, plane_height=plane_height, gripper=False)
-    return view.render(Frame(rgb, None, camera, workspace))["persp"]
+    if isinstance(camera, Camera):
+        rgb, camera = [rgb], [camera]  # type: ignore[list-item]
+    frame, *others = [Frame(color, None, one, workspace) for color, one in zip(rgb, camera, strict=True)]
+    return view.render(replace(frame, others=tuple(others)))["persp"]
 
 
 @dataclass(frozen=True)
@@ -90,9 +102,25 @@ class PerspectiveView(View):
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the warped image and, if the gripper's state is known, the gripper image."""
         plane_height = self.plane(frame.gripper_height)
-        images = {"persp": warp_plane(frame.rgb, warp_map(frame.camera, frame.workspace, self.size, plane_height))}
+        images = {"persp": self._warped(frame, plane_height)}
         if self.gripper and frame.gripper is not None:
             from lerobot_symview.geometry.gripper import gripper_image_uint8  # slow import: numba
 
             images["persp_gripper"] = gray_to_rgb(gripper_image_uint8(frame.gripper, frame.workspace, self.size))
         return images
+
+    def _warped(self, frame: Frame, plane_height: float) -> NDArray[np.uint8]:
+        """Return the warped image (size, size, 3) uint8; of several cameras, by the best at each pixel."""
+        warps = [
+            (warp_map(one.camera, frame.workspace, self.size, plane_height), one) for one in (frame, *frame.others)
+        ]
+        images = [warp_plane(one.rgb, warp) for warp, one in warps]
+        if not frame.others:
+            return images[0]
+        density = [
+            np.where(inside_image(warp, one.camera), pixel_density(one.camera, frame.workspace, self.size), -1.0)
+            for warp, one in warps
+        ]
+        best = np.argmax(density, axis=0)
+        chosen: NDArray[np.uint8] = np.take_along_axis(np.stack(images), best[None, ..., None], axis=0)[0]
+        return chosen

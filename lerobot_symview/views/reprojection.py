@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral
@@ -34,15 +35,26 @@ class Reprojection(NamedTuple):
     seen: NDArray[np.bool_]
 
 
+class _Source(NamedTuple):
+    """What a view reads of a frame: colour (H, W, 3) uint8, depth (H, W) float metres, and their camera."""
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.floating]
+    camera: Camera
+
+
 def reproject(
-    rgb: NDArray[np.uint8],
-    depth: NDArray,
-    camera: Camera,
+    rgb: NDArray[np.uint8] | Sequence[NDArray[np.uint8]],
+    depth: NDArray | Sequence[NDArray],
+    camera: Camera | Sequence[Camera],
     workspace: Workspace,
     gripper: NDArray[np.floating] | None = None,
     **options: Any,
 ) -> Reprojection:
     """Reproject an RGBD image to a top-down view of the workspace (paper section 4.1).
+
+    The first three arguments may be lists, of several cameras: each cell then shows its highest surface by the camera
+    that has the most pixels of it (`lerobot_symview.geometry.fusion`).
 
     Args:
         rgb: (H, W, 3) uint8.
@@ -58,7 +70,7 @@ def reproject(
         Colour, height and the mask of measured pixels.
 
     Raises:
-        ValueError: if an image's shape or dtype is wrong, or an option is unknown.
+        ValueError: if an image's shape or dtype is wrong, an option is unknown, or lists differ in length.
 
     Example:
         ```python
@@ -71,7 +83,13 @@ def reproject(
     """
     view = ViewSpec("reproj", options | {"height": True, "mask": True}).make()
     gripper = None if gripper is None else np.asarray(gripper)
-    images = view.render(Frame(rgb, aligned_depth(in_metres(depth), camera), camera, workspace, gripper))
+    if isinstance(camera, Camera):
+        rgb, depth, camera = [rgb], [depth], [camera]  # type: ignore[list-item]
+    frame, *others = [
+        Frame(color, aligned_depth(in_metres(distance), one), one, workspace, gripper)
+        for color, distance, one in zip(rgb, depth, camera, strict=True)
+    ]
+    images = view.render(replace(frame, others=tuple(others)))
     return Reprojection(images["reproj"], images["reproj_height"], images["reproj_seen"][..., 0] > 0)
 
 
@@ -145,7 +163,34 @@ class ReprojectedView(View):
 
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return the outputs; black and height 0 where no point was measured or infilled."""
-        from lerobot_symview.geometry import flying_pixels, infill, occlusion, upsampling, zbuffer  # slow import: numba
+        from lerobot_symview.geometry import fusion, infill, occlusion, zbuffer  # slow import: numba
+
+        ceiling = self.ceiling(frame.gripper_height)
+        sources = [self._source(one) for one in (frame, *frame.others)]
+        buffers = [
+            zbuffer.zbuffer_from_depth([source.depth], [source.camera], frame.workspace, self.size, ceiling)
+            for source in sources
+        ]
+        buffer = buffers[0]
+        if frame.others:
+            buffer = fusion.fuse_buffers(buffers, [source.camera for source in sources], frame.workspace)
+        seen = buffer.source != zbuffer.EMPTY
+        is_nearest = self.infill in ("nearest", "occlusion")
+        shown = infill.nearest_known(seen) if is_nearest else _identity_cells(self.size)
+        if self.infill == "occlusion":
+            for source in sources:
+                shown = occlusion.without_smear(shown, buffer, source.depth, source.camera, frame.workspace)
+        colors, height = zbuffer.gather(shown, buffer, [source.rgb for source in sources])
+        if self.infill == "local":
+            colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)
+        images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
+        if self.mask:
+            images["reproj_seen"] = gray_to_rgb(seen.astype(np.uint8) * np.uint8(255))
+        return {output: images[output] for output in self.outputs}
+
+    def _source(self, frame: Frame) -> _Source:
+        """Return a frame's images and camera, without flying pixels and upsampled, as the options say."""
+        from lerobot_symview.geometry import flying_pixels, upsampling
 
         if frame.depth is None:
             raise ValueError("the view 'reproj' needs depth; use 'persp' for a camera without depth")
@@ -155,21 +200,7 @@ class ReprojectedView(View):
         if self.source_scale > 1:
             depth, camera = upsampling.enlarge_depth(depth, self.source_scale), _enlarged(camera, self.source_scale)
             rgb = rgb.repeat(self.source_scale, axis=0).repeat(self.source_scale, axis=1)
-        buffer = zbuffer.zbuffer_from_depth(
-            [depth], [camera], frame.workspace, self.size, self.ceiling(frame.gripper_height)
-        )
-        seen = buffer.source != zbuffer.EMPTY
-        is_nearest = self.infill in ("nearest", "occlusion")
-        shown = infill.nearest_known(seen) if is_nearest else _identity_cells(self.size)
-        if self.infill == "occlusion":
-            shown = occlusion.without_smear(shown, buffer, depth, camera, frame.workspace)
-        colors, height = zbuffer.gather(shown, buffer, rgb.reshape(-1, 3))
-        if self.infill == "local":
-            colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)
-        images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
-        if self.mask:
-            images["reproj_seen"] = gray_to_rgb(seen.astype(np.uint8) * np.uint8(255))
-        return {output: images[output] for output in self.outputs}
+        return _Source(rgb, depth, camera)
 
     def ceiling(self, gripper_height: float | None) -> float:
         """Return the height above which points are removed, metres; infinite if the gripper's height is unknown."""

@@ -87,8 +87,9 @@ def benchmark_views(config: ViewsBenchmark) -> dict[str, float]:
         `floor_ratio`: time to copy the bytes that a reprojection reads and writes, over the same. `vga_ms`,
         `vga_lens_ms`, `vga_unaligned_ms` and `hd_ms`: a frame of 640 x 480 pixels reprojected, the same with a lens,
         the same with depth from a sensor of its own, and a frame of 1280 x 720. `vga_lens_ratio` and
-        `vga_unaligned_ratio`: the second and third over the first; the aim is 2. `batched_*`, on a GPU: time per frame
-        of a batch, without quartiles. `offline_codec_share`: part of `symview-add-views` spent on reading, decoding,
+        `vga_unaligned_ratio`: the second and third over the first; the aim is 2. `fused_ms` and `fused_ratio`: two
+        frames of 640 x 480 in one view, and over one; the aim is 2.2. `batched_*`, on a GPU: time per frame of a batch,
+        without quartiles. `offline_codec_share`: part of `symview-add-views` spent on reading, decoding,
         encoding and writing, for images with a real camera's noise. `offline_two_process_speedup`: speed-up by a second
         process including its start-up, most of which falls into the first round. `frames_per_s`: frames for which one
         process makes both views.
@@ -212,13 +213,15 @@ def real_camera_times(repeats: int) -> dict[str, float]:
 
     calls: dict[str, Callable[[], object]] = {name: partial(view.render, frame) for name, frame in frames.items()}
     calls["vga_unaligned"] = render_unaligned
+    other = _table_frame(CameraSpec(height=480, width=640, azimuth_deg=90.0).place(workspace), workspace)
+    calls["fused"] = partial(view.render, replace(frames["vga"], others=(other,)))
     for call in calls.values():
         call()
     rounds = [{name: 1000 * seconds(call) for name, call in calls.items()} for _ in range(repeats)]
     results: dict[str, float] = {}
     for name in calls:
         results |= _median_and_quartiles(f"{name}_ms", [times[name] for times in rounds])
-    for name in ("vga_lens", "vga_unaligned"):
+    for name in ("vga_lens", "vga_unaligned", "fused"):
         results |= _median_and_quartiles(f"{name}_ratio", [times[name] / times["vga"] for times in rounds])
     return results
 

@@ -130,7 +130,7 @@ def test_depth_and_camera_of_different_sizes_are_rejected(workspace):
 def test_gather_returns_the_colour_and_height_of_the_shown_cells(workspace):
     points = np.array([[0.36, -0.09, 0.1], [0.54, 0.09, 0.2]])
     buffer = zbuffer_from_points(points, workspace, 2)
-    colors = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.uint8)
-    rgb, height = gather(np.array([[0, 3], [1, -1]], dtype=np.int32), buffer, colors)
+    colors = np.array([[[1, 2, 3], [4, 5, 6]]], dtype=np.uint8)
+    rgb, height = gather(np.array([[0, 3], [1, -1]], dtype=np.int32), buffer, [colors])
     assert rgb.tolist() == [[[1, 2, 3], [4, 5, 6]], [[0, 0, 0], [0, 0, 0]]]
     np.testing.assert_allclose(height, [[0.1, 0.2], [0, 0]], rtol=1e-6)
