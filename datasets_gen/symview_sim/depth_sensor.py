@@ -27,12 +27,13 @@ def degrade(
     Returns:
         (H, W) float32, metres, 0 = invalid.
     """
+    beside = _beside_discontinuities(depth)
     if flying > 0:
-        depth = _with_flying_pixels(depth, flying, rng)
+        depth = _with_flying_pixels(depth, beside, flying, rng)
     measured = depth + noise * depth**2 * rng.standard_normal(depth.shape)
     if dropout > 0:
         lost = rng.random(depth.shape)
-        lost[_beside_discontinuities(depth)] /= EDGE_FACTOR
+        lost[beside] /= EDGE_FACTOR
         measured[lost < dropout] = 0.0
     return np.where(depth > 0, np.maximum(measured, 0.0), 0.0).astype(np.float32)
 
@@ -49,10 +50,12 @@ def _beside_discontinuities(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     return beside
 
 
-def _with_flying_pixels(depth: NDArray[np.float32], share: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return depth in which some pixels beside a discontinuity have a depth between their neighbours'."""
+def _with_flying_pixels(
+    depth: NDArray[np.float32], beside: NDArray[np.bool_], share: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Return depth in which some of the pixels `beside` discontinuities have a depth between their neighbours'."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(depth, 1, mode="edge"), (3, 3))
     nearest, farthest = around.min(axis=(2, 3)), around.max(axis=(2, 3))
-    flies = _beside_discontinuities(depth) & (nearest > 0) & (rng.random(depth.shape) < share)
+    flies = beside & (nearest > 0) & (rng.random(depth.shape) < share)
     weight = rng.random(depth.shape, dtype=np.float32)
     return np.where(flies, nearest + weight * (farthest - nearest), depth)

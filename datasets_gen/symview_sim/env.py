@@ -37,9 +37,9 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     [0, 1].
     Observation: `pixels[<camera>]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W), metres along the optical
     axis, 0 = invalid; `pixels[<camera>_segmentation]` uint8 (H, W, 3), the same label in each channel: 0 table,
-    1 robot, 2 and up objects; `camera.<camera>.intrinsics` float32 (9,), pixels, row-major;
-    `camera.<camera>.world_from_cam` float32 (16,), row-major; `agent_pos` float32 (5,): gripper x, y (metres, relative
-    to the workspace centre), z (metres), yaw (radians), aperture.
+    1 robot, 2 and up objects; as the calibration states them, `camera.<camera>.intrinsics` float32 (9,), pixels,
+    row-major, and `camera.<camera>.world_from_cam` float32 (16,), row-major; `agent_pos` float32 (5,): gripper x, y
+    (metres, relative to the workspace centre), z (metres), yaw (radians), aperture.
     Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` is the same as a bool.
     Start: gripper open, 20 cm above the workspace centre; objects at random poses; cameras with a spread at a new
     random pose.
@@ -97,8 +97,8 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self.scene.reset(np.clip(start, *self._reach), gripper_yaw=0.0)
         self.episode_task.spawn(self.scene, self.np_random)
         self.scene.settle()
-        # cameras do not change the physics
-        pose_rng, self._sensor_rng, calibration_rng = self.np_random.spawn(3)
+        pose_rng, self._sensor_rng = self.np_random.spawn(2)  # cameras do not change the physics
+        (calibration_rng,) = pose_rng.spawn(1)
         for spec in self.specs:
             if spec.varies or not self._placed:
                 self.cameras[spec.name] = place_in_sight(spec, self.scene.client, self.workspace, pose_rng)

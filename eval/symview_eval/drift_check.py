@@ -83,7 +83,10 @@ def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
 
 
 def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
-    """Compare an image that the camera takes now with the dataset's last episode, and report whether it has moved.
+    """Compare an image that the camera takes now with the dataset, and report whether the camera was moved since.
+
+    The reference is the first episode with the last episode's calibration, as in `check_drift`: the calibration is
+    right there.
 
     Args:
         reader: of the camera's frames.
@@ -94,8 +97,10 @@ def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
         CalibrationError: if the file is no image, or shows something else.
     """
     ((name, image),) = from_files(str(file)).items()
-    episode = len(reader.dataset.episodes) - 1
-    frame = reader.frame(episode, 0)
+    count = len(reader.dataset.episodes)
+    last = reader.frame(count - 1, 0)
+    frames = ((index, reader.frame(index, 0)) for index in range(count))
+    episode, frame = next((index, one) for index, one in frames if one.camera == last.camera)
     try:
         drift = image_drift(frame.rgb, image)
     except CalibrationError as error:

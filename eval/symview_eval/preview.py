@@ -86,8 +86,8 @@ class PreviewConfig:
     """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
     the camera as it stands in the last of them."""
     check_image: Path | None = None
-    """An image that the camera takes now, such as one of `lerobot-find-cameras`: warn if the camera was moved since the
-    last episode, and write `cameras.yaml`."""
+    """An image that the camera takes now, such as one of `lerobot-find-cameras`: warn if the camera was moved since its
+    calibration, and write `cameras.yaml`."""
     max_holes: float = 0.5
     """Fraction of a reprojected view's pixels that may be inferred before a warning is given."""
     rerun: bool = field(default_factory=lambda: find_spec("rerun") is not None)
@@ -100,6 +100,8 @@ class PreviewConfig:
             raise ValueError(f"--frames must be at least 1, got {self.frames}")
         if not self.episodes:
             raise ValueError("--episodes is empty: give at least one, such as --episodes='[0]'")
+        if self.check and self.check_image is not None:
+            raise ValueError("--check and --check_image both write cameras.yaml: give one of them")
         if self.check_image is not None and not self.check_image.expanduser().is_file():
             raise ValueError(f"--check_image must be an image file, got {self.check_image}")
         if not 0 <= self.max_holes <= 1:

@@ -95,11 +95,12 @@ def inside_image(image_from_topdown: WarpMap, camera: Camera) -> NDArray[np.bool
 
 
 @lru_cache(maxsize=64)
-def pixel_density(camera: Camera, workspace: Workspace, pixels: int) -> NDArray[np.float32]:
-    """Return how many of a camera's pixels show a square metre of the table, at every pixel of a top-down image.
+def pixel_density(camera: Camera, workspace: Workspace, pixels: int, plane_height: float = 0.0) -> NDArray[np.float32]:
+    """Return how many of a camera's pixels show a square metre of a plane, at every pixel of its top-down image.
 
-    It is the Jacobian determinant of the table's homography, fx fy h / d^3, for a camera at the height h that sees the
-    place at the depth d along its optical axis: it grows with resolution and angle, and falls with distance.
+    It is the Jacobian determinant of the plane's homography, fx fy h / d^3, for a camera at the height h above the
+    plane that sees the place at the depth d along its optical axis: it grows with resolution and angle, and falls with
+    distance.
 
     Returns:
         (pixels, pixels) float32; 0 behind the camera.
@@ -107,9 +108,9 @@ def pixel_density(camera: Camera, workspace: Workspace, pixels: int) -> NDArray[
     rows, columns = np.meshgrid(np.arange(pixels), np.arange(pixels), indexing="ij")
     xy = workspace.xy_from_pixel(np.stack([rows, columns], axis=-1), pixels)
     axis = camera.cam_from_world[2]
-    depth = xy @ axis[:2] + axis[3]
+    depth = xy @ axis[:2] + axis[2] * plane_height + axis[3]
     with np.errstate(divide="ignore"):
-        density = camera.fx * camera.fy * camera.position[2] / depth**3
+        density = camera.fx * camera.fy * abs(camera.position[2] - plane_height) / depth**3
     return np.where(depth > 0, density, 0.0).astype(np.float32)
 
 

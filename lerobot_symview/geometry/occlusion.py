@@ -32,12 +32,14 @@ def without_smear(
 
     An empty pixel contradicts it if the camera looks through the point at the pixel's place and the shown cell's
     height, unless that is the table's. It then shows the first cell behind it, seen from the camera, that contradicts
-    nothing; if there is none, the first in front of it; else it is kept unchanged.
+    nothing; if there is none, the first in front of it; else it is kept unchanged. Several cameras are treated one
+    after the other; a later one may choose a cell that contradicts an earlier one.
 
     Args:
         shown: (P, P) int32, row-major index of the cell that each pixel shows, such as the nearest known; -1 for none.
         buffer: (P, P) heights and sources.
-        depth: (H, W) float, metres along the optical axis; 0, negative and non-finite pixels contradict nothing.
+        depth: (H, W) float, metres along the optical axis; 0, negative and non-finite pixels contradict nothing, nor
+            does what a lens shows outside of the pinhole image of the same K and size.
         camera: its calibration.
         workspace: the square on the table that the image shows.
 

@@ -118,7 +118,11 @@ class PerspectiveView(View):
         if not frame.others:
             return images[0]
         density = [
-            np.where(inside_image(warp, one.camera), pixel_density(one.camera, frame.workspace, self.size), -1.0)
+            np.where(
+                inside_image(warp, one.camera),
+                pixel_density(one.camera, frame.workspace, self.size, plane_height),
+                -1.0,
+            )
             for warp, one in warps
         ]
         best = np.argmax(density, axis=0)

@@ -51,6 +51,8 @@ class SymviewSacfdConfig(SymviewConfig):
     def check(self) -> None:
         """Check the fields of all policies and those of soft actor-critic."""
         super().check()
+        if self.check_camera:
+            raise ValueError("--policy.check_camera is for cloned policies: simulators give views in place of images")
         self._check_choice("target_update", ("polyak", "hard"))
         for name in ("discount", "target_tau"):
             if not 0 < getattr(self, name) <= 1:

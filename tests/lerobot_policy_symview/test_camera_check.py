@@ -7,12 +7,14 @@ import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.runtime.flag_errors import FlagError
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.helpers.datasets import views_config
@@ -63,7 +65,7 @@ def test_a_moved_camera_is_warned_of_with_millimetres(checkpoint, frame, caplog)
     assert action.isfinite().all()
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "has moved by 4.0 pixels, up to" in warning
-    assert "mm on the table: calibrate it again" in warning
+    assert "mm on the table: move it back" in warning
 
 
 @pytest.mark.parametrize("kind", ["lens cap", "another scene", "upside down"])
@@ -94,6 +96,18 @@ def test_the_check_can_be_switched_off_but_not_on_without_an_image(checkpoint, f
     config.check_camera = True
     with pytest.raises(ValueError, match=r"needs a policy that was trained with --policy\.check_camera=true"):
         SymviewBcPolicy.from_pretrained(tmp_path, config=config)
+
+
+def test_a_policy_on_the_cameras_own_image_is_checked_too(monkeypatch, recorded, tmp_path, frame):
+    checkpoint = train(monkeypatch, recorded, tmp_path / "policy", CHECK, "--policy.method=sideview_equi")
+    assert act(checkpoint, frame)[1].isfinite().all()
+    with pytest.raises(CalibrationError, match="does not show what it showed"):
+        act(checkpoint, frame | {IMAGE: torch.zeros_like(frame[IMAGE])})
+
+
+def test_reinforcement_learning_has_no_images_to_compare():
+    with pytest.raises(FlagError, match=r"--policy\.check_camera is for cloned policies"):
+        SymviewSacfdConfig(check_camera=True)
 
 
 def test_policies_without_the_check_store_no_image():

@@ -232,13 +232,15 @@ def test_an_image_of_today_tells_whether_the_camera_was_moved(tmp_path, caplog):
         return caplog.text
 
     still = re.compile(r"camera 'front' stands still: in same\.png its image has moved by 0\.\d pixels")
-    moved = re.compile(r"was moved since episode 1: in moved\.png its image by (3\.[7-9]|4\.[0-4]) pixels")
+    moved = re.compile(r"was moved since episode 0: in moved\.png its image by (3\.[7-9]|4\.[0-4]) pixels")
     assert still.search(check("same.png"))
     assert not written.exists()
     assert moved.search(check("moved.png"))
     now = read_calibration(written).camera("front")
     assert pose_errors(before, now.world_from_cam)[0] == pytest.approx(np.rad2deg(np.arctan(4 / K[0, 0])), abs=0.05)
-    with pytest.raises(CalibrationError, match=r"--check_image: .*black\.png cannot be compared with episode 1"):
+    with pytest.raises(CalibrationError, match=r"--check_image: .*black\.png cannot be compared with episode 0"):
         check("black.png")
     with pytest.raises(ValueError, match=r"--check_image must be an image file, got .*missing\.png"):
         config(folder, tmp_path, check_image=tmp_path / "missing.png")
+    with pytest.raises(ValueError, match="give one of them"):
+        config(folder, tmp_path, check=True, check_image=tmp_path / "same.png")

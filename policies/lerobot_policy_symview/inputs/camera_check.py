@@ -65,7 +65,7 @@ def with_reference(state: Mapping[str, Any], own: Tensor | None) -> dict[str, An
     if own is None:
         return others
     image = own if own.any() else state.get(REFERENCE)
-    if image is None:
+    if image is None or not image.any():
         raise ValueError("--policy.check_camera needs a policy that was trained with --policy.check_camera=true")
     return {**others, REFERENCE: image}
 
@@ -104,6 +104,11 @@ def check_image(config: SymviewConfig, reference: Tensor, observation: Mapping[s
         f"since the demonstrations the image of camera {config.seen_camera!r} has moved by {drift.pixels:.1f} pixels"
     )
     if drift.pixels > MOST_DRIFT:
-        logger.warning("%s%s: calibrate it again and give --policy.calibration, or move it back", moved, on_table)
+        logger.warning(
+            "%s%s: move it back; or calibrate it again, give --policy.calibration, and skip this with "
+            "--policy.check_camera=false",
+            moved,
+            on_table,
+        )
     else:
         logger.info("%s", moved)

@@ -119,7 +119,7 @@ def read_calibration(config: SymviewConfig) -> None:
         CalibrationError: if the calibration in the dataset is invalid.
     """
     meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
-    if meta is not None and config.uses_calibration:
+    if meta is not None and (config.uses_calibration or config.check_camera):
         name = next(iter(config.substitutes(meta.features)), config.camera)
         camera = _fixed_camera(meta, name)
         if camera is not None:

@@ -55,7 +55,7 @@ def _windows(values: Tensor, cells: Tensor) -> Tensor:
     z, x, y = torch.meshgrid(*[torch.arange(WINDOW, device=values.device)] * 3, indexing="ij")
     offsets = ((z * sizes[1] + x) * sizes[2] + y).flatten()
     voxels = (first[:, None] + offsets).flatten()
-    # not padded[voxels], whose backward pass is ten times slower
+    # not padded[voxels], whose backward pass is ten times slower; on CUDA its gradients may differ in their last bits
     return padded.flatten(0, 3).index_select(0, voxels).view(len(cells), WINDOW**3 * values.shape[-1])
 
 

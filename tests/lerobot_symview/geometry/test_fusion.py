@@ -50,14 +50,15 @@ def test_a_cell_shows_the_camera_with_most_pixels_of_it():
     assert (swapped == shown).mean() > 0.97  # in between, infill chooses among equally near points
 
 
+@pytest.mark.parametrize("height", [0.0, 0.1])
 @pytest.mark.parametrize("camera", CAMERAS["pinhole"])
-def test_pixel_density_is_the_determinant_of_the_projection(camera):
+def test_pixel_density_is_the_determinant_of_the_projection(camera, height):
     cells = np.array([[3, 140], [76, 20], [120, 90]])
-    points = np.column_stack([WORKSPACE.xy_from_pixel(cells, 152), np.zeros(3)])
+    points = np.column_stack([WORKSPACE.xy_from_pixel(cells, 152), np.full(3, height)])
     steps = np.array([[1e-6, 0, 0], [0, 1e-6, 0]])
     jacobian = np.stack([(project(points + step, camera)[0] - project(points - step, camera)[0]) for step in steps])
     expected = np.abs(np.linalg.det(jacobian.transpose(1, 0, 2) / 2e-6))
-    np.testing.assert_allclose(pixel_density(camera, WORKSPACE, 152)[tuple(cells.T)], expected, rtol=1e-5)
+    np.testing.assert_allclose(pixel_density(camera, WORKSPACE, 152, height)[tuple(cells.T)], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
