@@ -27,7 +27,7 @@ def degrade(
     Returns:
         (H, W) float32, metres, 0 = invalid.
     """
-    beside = _beside_discontinuities(depth)
+    beside = _beside_discontinuities(depth) if max(flying, dropout) > 0 else np.zeros(depth.shape, dtype=bool)
     if flying > 0:
         depth = _with_flying_pixels(depth, beside, flying, rng)
     measured = depth + noise * depth**2 * rng.standard_normal(depth.shape)

@@ -66,7 +66,7 @@ class SymviewEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self._robot = lookup("robot", settings.robot, ROBOTS)
         self.specs = settings.all_cameras
         self.cameras = {spec.name: spec.place(self.workspace) for spec in self.specs}
-        self._stated = dict(self.cameras)  # as their calibration, which may be wrong, states them
+        self._stated: dict[str, Camera] = {}  # the cameras as their calibration, which may be wrong, states them
         self._recent: dict[str, deque[CameraImages]] = {}
         self._placed = False
         self._scene: Scene | None = None

@@ -20,7 +20,6 @@ from lerobot_symview.calibration.table_plane import has_depth, levelled
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera
-from lerobot_symview.geometry.visibility import table_resolution
 from lerobot_symview.views import Frame
 from symview_eval.calibrate.output import replace_file
 from symview_eval.calibrate.photographs import from_files
@@ -56,7 +55,7 @@ def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
         logger.info("camera %r: every episode has a calibration of its own, there is nothing to compare", reader.camera)
         return measured
     farthest = max(measured, key=lambda one: one.drift.pixels)
-    length = _length(reader, farthest.frame, farthest.drift)
+    length = farthest.drift.described(farthest.frame.camera, reader.workspace)
     if not moved:
         logger.info(
             "camera %r stands still: its image moves by at most %s in %d episodes",
@@ -105,7 +104,7 @@ def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
         drift = image_drift(frame.rgb, image)
     except CalibrationError as error:
         raise CalibrationError(f"{file} cannot be compared with episode {episode}: {error}") from None
-    length = _length(reader, frame, drift)
+    length = drift.described(frame.camera, reader.workspace)
     if drift.pixels <= MOST_DRIFT:
         logger.info("camera %r stands still: in %s its image has moved by %s", reader.camera, name, length)
         return drift
@@ -118,12 +117,6 @@ def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
     )
     _write_moved(reader, frame, drift, name, None, output_dir)
     return drift
-
-
-def _length(reader: FrameReader, frame: Frame, drift: Drift) -> str:
-    resolution = table_resolution(frame.camera, reader.workspace)
-    on_table = f" (up to {drift.pixels / resolution:.1f} mm on the table)" if resolution > 0 else ""
-    return f"{drift.pixels:.1f} pixels{on_table}"
 
 
 def _measured(reader: FrameReader) -> list[EpisodeDrift]:

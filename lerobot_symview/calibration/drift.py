@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid, to_ideal, transform
+from lerobot_symview.geometry.visibility import table_resolution
+from lerobot_symview.geometry.workspace import Workspace
 
 MOST_FEATURES, QUALITY, SPACING = 500, 0.01, 8  # of Shi and Tomasi's corners; SPACING in pixels
 WINDOW, LEVELS = (21, 21), 4  # of the tracker of Lucas and Kanade: motions of up to a hundred pixels
@@ -38,6 +40,12 @@ class Drift:
     def pixels(self) -> float:
         """Median length of the displacements."""
         return float(np.median(np.linalg.norm(self.after - self.before, axis=1)))
+
+    def described(self, camera: Camera, workspace: Workspace) -> str:
+        """Return the displacement in words: pixels, and how much that is on the table where the image is coarsest."""
+        resolution = table_resolution(camera, workspace)
+        on_table = f" (up to {self.pixels / resolution:.1f} mm on the table)" if resolution > 0 else ""
+        return f"{self.pixels:.1f} pixels{on_table}"
 
 
 def image_drift(reference: NDArray[np.uint8], image: NDArray[np.uint8]) -> Drift:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import pixel_density
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.geometry.zbuffer import EMPTY, ZBuffer, zbuffer_from_depth
+from lerobot_symview.geometry.zbuffer import EMPTY, ZBuffer, empty_buffer, zbuffer_from_depth
 
 SAME_SURFACE = 0.01  # metres: points of a cell that are no farther apart may belong to one surface
 DISAGREEMENT_PIXELS = 96  # rows and columns of the buffers that are compared
@@ -32,7 +32,7 @@ def fuse_buffers(buffers: Sequence[ZBuffer], cameras: Sequence[Camera], workspac
         A buffer whose source is the row-major index of the pixel, counted over all images in order.
     """
     pixels = len(buffers[0].height)
-    fused = ZBuffer(np.zeros((pixels, pixels), np.float32), np.full((pixels, pixels), EMPTY, np.int32))
+    fused = empty_buffer(pixels)
     density, first = np.zeros((pixels, pixels), np.float32), 0
     for buffer, camera in zip(buffers, cameras, strict=True):
         _add(*buffer, pixel_density(camera, workspace, pixels), first, *fused, density)
@@ -61,7 +61,7 @@ def disagreement(
         From 0 to 1; 0 where no cells can be compared.
     """
     buffers = [
-        zbuffer_from_depth([depth], [camera], workspace, DISAGREEMENT_PIXELS, ceiling)
+        zbuffer_from_depth(depth, camera, workspace, DISAGREEMENT_PIXELS, ceiling)
         for depth, camera in zip(depths, cameras, strict=True)
     ]
     shares = [0.0]

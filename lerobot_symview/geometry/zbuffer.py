@@ -1,4 +1,4 @@
-"""Orthographic top-down z-buffer of points or depth images: each cell keeps its highest point.
+"""Orthographic top-down z-buffer of points or a depth image: each cell keeps its highest point.
 
 Compiled with numba. Heights are compared in float32; ties go to the first point.
 """
@@ -43,47 +43,43 @@ def zbuffer_from_points(points: Array, workspace: Workspace, pixels: int, ceilin
     Returns:
         A buffer whose source is the point's index. Points outside the workspace's square are ignored.
     """
-    buffer = _empty_buffer(pixels)
+    buffer = empty_buffer(pixels)
     rows_columns = workspace.pixel_from_xy(points[:, :2], pixels) + 0.5
     _draw_points(rows_columns, points[:, 2], ceiling, *buffer)
     return buffer
 
 
 def zbuffer_from_depth(
-    depths: Sequence[NDArray[np.floating]],
-    cameras: Sequence[Camera],
+    depth: NDArray[np.floating],
+    camera: Camera,
     workspace: Workspace,
     pixels: int,
     ceiling: float = np.inf,
 ) -> ZBuffer:
-    """Render depth images of one or more cameras into one top-down z-buffer (paper Eq. 2-6).
+    """Render a depth image into a top-down z-buffer (paper Eq. 2-6).
 
     Equivalent to `unproject` and `zbuffer_from_points`, in one pass and without an array of points.
 
     Args:
-        depths: (H, W) float each, metres along the optical axis; 0, negative, infinite and NaN are ignored.
-        cameras: calibrated camera of each depth image.
+        depth: (H, W) float, metres along the optical axis; 0, negative, infinite and NaN are ignored.
+        camera: its calibration.
         workspace: the square on the table that the grid covers.
         pixels: rows and columns of the grid.
         ceiling: metres above the table; higher points are ignored.
 
     Returns:
-        A buffer whose source is the row-major index of the pixel, counted over all images in order.
+        A buffer whose source is the row-major index of the pixel.
 
     Raises:
-        ValueError: if a depth image and its camera differ in size.
+        ValueError: if the depth image and the camera differ in size.
     """
-    buffer = _empty_buffer(pixels)
-    first = 0
-    for depth, camera in zip(depths, cameras, strict=True):
-        if depth.shape != (camera.height, camera.width):
-            raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
-        grid = grid_from_pixel(camera, workspace, pixels)
-        if camera.lens is None:
-            _draw_depth(depth, *grid, ceiling, first, *buffer)
-        else:
-            _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, ceiling, first, *buffer)
-        first += depth.size
+    if depth.shape != (camera.height, camera.width):
+        raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
+    buffer, grid = empty_buffer(pixels), grid_from_pixel(camera, workspace, pixels)
+    if camera.lens is None:
+        _draw_depth(depth, *grid, ceiling, *buffer)
+    else:
+        _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, ceiling, *buffer)
     return buffer
 
 
@@ -109,7 +105,8 @@ def gather(
     return rgb, height
 
 
-def _empty_buffer(pixels: int) -> ZBuffer:
+def empty_buffer(pixels: int) -> ZBuffer:
+    """Return a buffer of cells without points."""
     return ZBuffer(np.zeros((pixels, pixels), np.float32), np.full((pixels, pixels), EMPTY, np.int32))
 
 
@@ -151,7 +148,7 @@ def _draw_points(rows_columns, heights, ceiling, height, source):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
-def _draw_depth(depth, rays, origin, ceiling, first, height, source):  # type: ignore[no-untyped-def]
+def _draw_depth(depth, rays, origin, ceiling, height, source):  # type: ignore[no-untyped-def]
     side = height.shape[0]
     height, source = height.ravel(), source.ravel()
     rows, columns = depth.shape
@@ -170,11 +167,11 @@ def _draw_depth(depth, rays, origin, ceiling, first, height, source):  # type: i
                     rounded = np.float32(z)
                     if cell >= 0 and (source[cell] < 0 or rounded > height[cell]):
                         height[cell] = rounded
-                        source[cell] = first + v * columns + u
+                        source[cell] = v * columns + u
 
 
 @njit(cache=True, nogil=True)
-def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, first, height, source):  # type: ignore[no-untyped-def]
+def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, height, source):  # type: ignore[no-untyped-def]
     """Draw as `_draw_depth` does, with the same rounding, but look up the ideal pixels."""
     side = height.shape[0]
     height, source = height.ravel(), source.ravel()
@@ -192,7 +189,7 @@ def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, first, height
                     rounded = np.float32(z)
                     if cell >= 0 and (source[cell] < 0 or rounded > height[cell]):
                         height[cell] = rounded
-                        source[cell] = first + i * columns + j
+                        source[cell] = i * columns + j
 
 
 @njit(cache=True, nogil=True)

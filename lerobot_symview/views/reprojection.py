@@ -168,7 +168,7 @@ class ReprojectedView(View):
         ceiling = self.ceiling(frame.gripper_height)
         sources = [self._source(one) for one in (frame, *frame.others)]
         buffers = [
-            zbuffer.zbuffer_from_depth([source.depth], [source.camera], frame.workspace, self.size, ceiling)
+            zbuffer.zbuffer_from_depth(source.depth, source.camera, frame.workspace, self.size, ceiling)
             for source in sources
         ]
         buffer = buffers[0]

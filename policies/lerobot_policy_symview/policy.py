@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.encoders import make_encoder
-from lerobot_policy_symview.inputs.camera_check import REFERENCE, check_image, reference_image, with_reference
+from lerobot_policy_symview.inputs.camera_check import REFERENCE, check_observation, reference_image, with_reference
 from lerobot_policy_symview.inputs.feature_contract import read_calibration
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
@@ -195,7 +195,7 @@ class SymviewPolicy(PreTrainedPolicy):
         """
         self.eval()
         if self.config.check_camera and not (self._is_camera_checked or is_exporting()):
-            check_image(self.config, self.reference_image, self.scene.own_names(batch))
+            check_observation(self.config, self.reference_image, self.scene.own_names(batch))
             self._is_camera_checked = True
         with self.precision():
             scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))

@@ -64,8 +64,8 @@ def test_a_moved_camera_is_warned_of_with_millimetres(checkpoint, frame, caplog)
     _, action = act(checkpoint, frame | {IMAGE: shifted(frame[IMAGE], 4)})
     assert action.isfinite().all()
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert "has moved by 4.0 pixels, up to" in warning
-    assert "mm on the table: move it back" in warning
+    assert "has moved by 4.0 pixels (up to " in warning
+    assert "mm on the table): move it back" in warning
 
 
 @pytest.mark.parametrize("kind", ["lens cap", "another scene", "upside down"])

@@ -254,7 +254,10 @@ EXPERIMENTS = {
             (
                 MethodRow(REPROJ.name, "Nearest Interpolation", REPROJ.policy),
                 _row(
-                    "reproj_equi_occlusion", "Nearest, or behind", "reproj_equi", view_options={"infill": "occlusion"}
+                    "reproj_equi_occlusion",
+                    "Nearest, or behind the occluder",
+                    "reproj_equi",
+                    view_options={"infill": "occlusion"},
                 ),
                 _row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
                 _row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),

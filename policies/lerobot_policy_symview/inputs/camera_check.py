@@ -14,7 +14,6 @@ from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.visibility import table_resolution
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +26,9 @@ def reference_image(config: SymviewConfig) -> Tensor:
     Raises:
         ValueError: if the dataset lacks the camera's images, or its camera was moved.
     """
+    from lerobot_symview.datasets.frame_reader import FrameReader  # slow imports: pyarrow
+    from lerobot_symview.datasets.source import SourceDataset
+
     key = keys.rgb(config.seen_camera)
     meta: Any = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
     if meta is None:
@@ -38,16 +40,8 @@ def reference_image(config: SymviewConfig) -> Tensor:
             f"--policy.check_camera compares images of the camera {name!r} with those of the demonstrations: they must "
             f"have {keys.rgb(name)!r}, and one calibration of it in all frames"
         )
-    return torch.from_numpy(_first_image(Path(meta.root), keys.rgb(name)).copy())
-
-
-def _first_image(folder: Path, key: str) -> Any:
-    from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
-
-    dataset = SourceDataset(folder)
-    is_video = dataset.features[key]["dtype"] == "video"
-    table = EpisodeTables(dataset, dataset.data_file(0), ["timestamp"] if is_video else [key, "timestamp"]).read(0)
-    return next(iter(dataset.images(key, 0, table.slice(0, 1))))
+    reader = FrameReader(SourceDataset(Path(meta.root)), name, parse_workspace(config.workspace), views=())
+    return torch.from_numpy(reader.frame(0, 0).rgb.copy())
 
 
 def with_reference(state: Mapping[str, Any], own: Tensor | None) -> dict[str, Any]:
@@ -70,7 +64,7 @@ def with_reference(state: Mapping[str, Any], own: Tensor | None) -> dict[str, An
     return {**others, REFERENCE: image}
 
 
-def check_image(config: SymviewConfig, reference: Tensor, observation: Mapping[str, Tensor]) -> None:
+def check_observation(config: SymviewConfig, reference: Tensor, observation: Mapping[str, Tensor]) -> None:
     """Warn of a camera that was moved since the demonstrations.
 
     Args:
@@ -98,17 +92,13 @@ def check_image(config: SymviewConfig, reference: Tensor, observation: Mapping[s
             f"the camera {config.seen_camera!r} does not show what it showed in the demonstrations: {error}; check its "
             "lens and its name, and calibrate it again if it was moved (--policy.check_camera=false skips this)"
         ) from None
-    resolution = table_resolution(camera, parse_workspace(config.workspace))
-    on_table = f", up to {drift.pixels / resolution:.0f} mm on the table" if resolution > 0 else ""
-    moved = (
-        f"since the demonstrations the image of camera {config.seen_camera!r} has moved by {drift.pixels:.1f} pixels"
-    )
+    length = drift.described(camera, parse_workspace(config.workspace))
+    moved = f"since the demonstrations the image of camera {config.seen_camera!r} has moved by {length}"
     if drift.pixels > MOST_DRIFT:
         logger.warning(
-            "%s%s: move it back; or calibrate it again, give --policy.calibration, and skip this with "
+            "%s: move it back; or calibrate it again, give --policy.calibration, and skip this with "
             "--policy.check_camera=false",
             moved,
-            on_table,
         )
     else:
         logger.info("%s", moved)

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lerobot_symview import Frame, Workspace, make_view, reproject, warp_table
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose, project
@@ -11,7 +13,7 @@ from lerobot_symview.geometry.fusion import SAME_SURFACE, disagreement, fuse_buf
 from lerobot_symview.geometry.homography import pixel_density
 from lerobot_symview.geometry.miscalibration import Miscalibration
 from lerobot_symview.geometry.zbuffer import EMPTY, ZBuffer, zbuffer_from_depth
-from tests.helpers.cameras import make_camera
+from tests.helpers.cameras import cameras, make_camera, random_depth
 from tests.lerobot_symview.geometry.test_occlusion import box_cells, table_with_box, with_lens
 
 WORKSPACE = Workspace()
@@ -86,6 +88,23 @@ def test_fused_buffers_equal_the_slow_reference(seed):
         assert (fused.height[row, column], fused.source[row, column]) == (np.float32(height), source)
 
 
+@given(first=cameras(), second=cameras(), seed=st.integers(0, 2**32 - 2))
+def test_a_fused_cell_shows_the_highest_surface_of_both_cameras(first, second, seed):
+    """Source indices continue from camera to camera."""
+    depths, pair = [random_depth(seed), random_depth(seed + 1)], [first, second]
+    alone = [zbuffer_from_depth(depth, camera, WORKSPACE, 24) for depth, camera in zip(depths, pair, strict=True)]
+    fused = fuse_buffers(alone, pair, WORKSPACE)
+    heights = [np.where(buffer.source == EMPTY, -np.inf, buffer.height) for buffer in alone]
+    known = fused.source != EMPTY
+    np.testing.assert_array_equal(known, np.maximum(*heights) > -np.inf)
+    assert (fused.height[known] >= np.maximum(*heights)[known] - np.float32(SAME_SURFACE)).all()
+    of_second = fused.source >= depths[0].size
+    expected = np.where(of_second, alone[1].source + depths[0].size, alone[0].source)
+    np.testing.assert_array_equal(fused.source, expected)
+    clear = known & (np.abs(heights[1] - heights[0]) > 1.001 * SAME_SURFACE)
+    np.testing.assert_array_equal(of_second[clear], (heights[1] > heights[0])[clear])
+
+
 def test_a_single_camera_and_one_without_depth_change_nothing():
     rgb, depth = table_with_box(FRONT)
     alone = reproject(rgb, depth, FRONT, WORKSPACE)
@@ -152,6 +171,6 @@ def test_what_does_not_fit_together_is_refused():
 
 def test_buffers_of_one_camera_are_its_own():
     _, depth = table_with_box(FRONT)
-    buffer = zbuffer_from_depth([depth], [FRONT], WORKSPACE, 64)
+    buffer = zbuffer_from_depth(depth, FRONT, WORKSPACE, 64)
     for one, other in zip(fuse_buffers([buffer], [FRONT], WORKSPACE), buffer, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -89,7 +89,7 @@ def test_a_reprojection_equals_that_of_the_unprojected_points(lens):
     cells = np.stack([unproject(depth, camera)[..., axis] for axis in range(2)], axis=-1).reshape(-1, 2)
     cells = ((cells - workspace.center) / workspace.size + 0.5) * 24
     heights = unproject(depth, camera)[..., 2].ravel()
-    buffer = zbuffer_from_depth([depth], [camera], workspace, 24, np.inf)
+    buffer = zbuffer_from_depth(depth, camera, workspace, 24, np.inf)
     reference = np.full((24, 24), -np.inf)
     for (row, column), height in zip(np.floor(cells).astype(int), heights, strict=True):
         if 0 <= row < 24 and 0 <= column < 24:

@@ -100,7 +100,7 @@ def test_replaced_cells_equal_the_slow_reference(seed):
     _, depth = table_with_box(camera, low, low + [*rng.uniform(0.03, 0.1, 2), 0.08])
     depth[rng.random(depth.shape) < 0.1] = 0
     depth[rng.random(depth.shape) < 0.02] = np.inf
-    buffer = zbuffer_from_depth([depth], [camera], WORKSPACE, 64)
+    buffer = zbuffer_from_depth(depth, camera, WORKSPACE, 64)
     shown = nearest_known(buffer.source != EMPTY)
     chosen = without_smear(shown, buffer, depth, camera, WORKSPACE)
     expected = slow_replacement(shown, buffer, depth, camera)

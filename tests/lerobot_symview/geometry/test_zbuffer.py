@@ -44,7 +44,7 @@ def slow_points(depth, camera):
 @given(camera=cameras(), seed=SEEDS, ceiling=st.sampled_from([np.inf, 0.1]))
 def test_zbuffer_from_depth_equals_the_reference(camera, seed, ceiling):
     depth, workspace = random_depth(seed), Workspace()
-    buffer = zbuffer_from_depth([depth], [camera], workspace, SIZE, ceiling)
+    buffer = zbuffer_from_depth(depth, camera, workspace, SIZE, ceiling)
     height, source = slow_zbuffer(slow_points(depth, camera), workspace, SIZE, ceiling)
     np.testing.assert_array_equal(buffer.source, source)
     np.testing.assert_allclose(buffer.height, height, atol=1e-6)
@@ -67,7 +67,7 @@ def test_zbuffer_from_depth_equals_that_of_unprojected_points(camera, seed):
     depth, workspace = random_depth(seed), Workspace()
     valid = np.isfinite(depth) & (depth > 0)
     points = np.where(valid[..., None], unproject(np.where(valid, depth, 1.0), camera), np.nan).reshape(-1, 3)
-    from_depth = zbuffer_from_depth([depth], [camera], workspace, SIZE)
+    from_depth = zbuffer_from_depth(depth, camera, workspace, SIZE)
     np.testing.assert_array_equal(from_depth.source, zbuffer_from_points(points, workspace, SIZE).source)
 
 
@@ -77,27 +77,15 @@ def test_zbuffer_from_depth_equals_that_of_unprojected_points(camera, seed):
 def test_transforming_world_and_camera_transforms_the_view_exactly(quarter_turns, reflect, camera, seed):
     depth, workspace = random_depth(seed), Workspace()
     labels = np.arange(depth.size, dtype=np.int64).reshape(depth.shape)
-    buffer = zbuffer_from_depth([depth], [camera], workspace, SIZE)
+    buffer = zbuffer_from_depth(depth, camera, workspace, SIZE)
     transformed_camera, transformed_depth = transformed(camera, depth, quarter_turns, reflect)
-    depths = [np.ascontiguousarray(transformed_depth)]
-    transformed_buffer = zbuffer_from_depth(depths, [transformed_camera], workspace, SIZE)
+    transformed_depth = np.ascontiguousarray(transformed_depth)
+    transformed_buffer = zbuffer_from_depth(transformed_depth, transformed_camera, workspace, SIZE)
     np.testing.assert_array_equal(transformed_buffer.height, transformed_image(buffer.height, quarter_turns, reflect))
     source = np.where(buffer.source == EMPTY, EMPTY, labels.ravel()[buffer.source])
     flipped = labels[:, ::-1] if reflect else labels
     transformed_source = np.where(transformed_buffer.source == EMPTY, EMPTY, flipped.ravel()[transformed_buffer.source])
     np.testing.assert_array_equal(transformed_source, transformed_image(source, quarter_turns, reflect))
-
-
-@given(first=cameras(), second=cameras(), seed=SEEDS)
-def test_several_cameras_share_one_buffer(first, second, seed):
-    """The highest point of all cameras is kept; source indices continue from camera to camera."""
-    depths, workspace = [random_depth(seed), random_depth(seed + 1)], Workspace()
-    pair = [first, second]
-    both = zbuffer_from_depth(depths, pair, workspace, SIZE)
-    alone = [zbuffer_from_depth([depth], [camera], workspace, SIZE) for depth, camera in zip(depths, pair, strict=True)]
-    second_wins = (alone[0].source == EMPTY) | (alone[1].source != EMPTY) & (alone[1].height > alone[0].height)
-    expected = np.where(second_wins & (alone[1].source != EMPTY), alone[1].source + depths[0].size, alone[0].source)
-    np.testing.assert_array_equal(both.source, expected)
 
 
 def test_the_highest_point_is_kept_and_ties_go_to_the_first(workspace):
@@ -108,12 +96,12 @@ def test_the_highest_point_is_kept_and_ties_go_to_the_first(workspace):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_depth_of_any_float_dtype_is_accepted(dtype, workspace):
     depth = random_depth(5, (152, 152)).astype(dtype)
-    assert (zbuffer_from_depth([depth], [make_camera()], workspace, SIZE).source != EMPTY).any()
+    assert (zbuffer_from_depth(depth, make_camera(), workspace, SIZE).source != EMPTY).any()
 
 
 @pytest.mark.parametrize("bad", [0.0, -0.7, np.nan, np.inf, -np.inf])
 def test_invalid_depth_gives_an_empty_buffer(bad, workspace):
-    buffer = zbuffer_from_depth([np.full((152, 152), bad)], [make_camera()], workspace, SIZE)
+    buffer = zbuffer_from_depth(np.full((152, 152), bad), make_camera(), workspace, SIZE)
     assert (buffer.source == EMPTY).all()
     assert not buffer.height.any()
 
@@ -124,7 +112,7 @@ def test_no_points_give_an_empty_buffer(workspace):
 
 def test_depth_and_camera_of_different_sizes_are_rejected(workspace):
     with pytest.raises(ValueError, match=r"depth has shape \(10, 10\), the camera is \(152, 152\)"):
-        zbuffer_from_depth([np.ones((10, 10))], [make_camera()], workspace, SIZE)
+        zbuffer_from_depth(np.ones((10, 10)), make_camera(), workspace, SIZE)
 
 
 def test_gather_returns_the_colour_and_height_of_the_shown_cells(workspace):
