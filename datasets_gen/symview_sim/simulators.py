@@ -11,7 +11,7 @@ import multiprocessing
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
@@ -27,7 +27,7 @@ from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.camera import stored_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
-from lerobot_symview.views import Frame, View, ViewSpec
+from lerobot_symview.views import Frame, View, ViewSpec, other_cameras
 from symview_sim.env import EnvObservation as RawObservation
 from symview_sim.env import SymviewEnv, checked_action, named_features
 from symview_sim.settings import EnvSettings
@@ -198,9 +198,7 @@ def _simulate(connection: Connection, config: SimulatorConfig) -> None:
     views = [spec.make() for spec in config.views]
     workspace = parse_workspace(config.workspace)
 
-    def report(raw: RawObservation) -> Observation:
-        return _observation(raw, config, views, workspace)
-
+    report = _Reporter(config, views, workspace)
     while True:
         try:
             command = connection.recv()
@@ -212,10 +210,13 @@ def _simulate(connection: Connection, config: SimulatorConfig) -> None:
         connection.send(replace(outcome, seconds=time.perf_counter() - start))
 
 
-def _carry_out(command: Reset | Step, env: SymviewEnv, report: Callable[[RawObservation], Observation]) -> Outcome:
+def _carry_out(command: Reset | Step, env: SymviewEnv, report: _Reporter) -> Outcome:
     if isinstance(command, Reset):
         raw, _ = env.reset(seed=command.seed)
+        report.start_episode()
         for action in command.actions:
+            if report.remembers:
+                report(raw)
             raw = env.step(action)[0]
         return Outcome(report(raw))
     raw, reward, terminated, truncated, info = env.step(command.action)
@@ -224,26 +225,37 @@ def _carry_out(command: Reset | Step, env: SymviewEnv, report: Callable[[RawObse
     if terminated or truncated:
         last, observation = observation, None
         if command.next_seed is not None:
+            report.start_episode()
             observation = report(env.reset(seed=command.next_seed)[0])
     return Outcome(observation, last, reward, terminated, info["is_success"])
 
 
-def _observation(
-    raw: RawObservation, config: SimulatorConfig, views: Sequence[View], workspace: Workspace
-) -> Observation:
-    features = named_features(raw)
-    camera, depth = config.camera, keys.depth(config.camera)
-    for view in views:
-        rgb = features[keys.rgb(camera)]
-        frame = Frame(
-            rgb,
-            features[depth][..., 0] if depth in features else None,
-            stored_camera(
-                features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
-            ),
-            workspace,
-            features[keys.STATE],
-        )
-        for output, image in view.render(frame).items():
-            features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
-    return {name: features[name] for name in config.names}
+class _Reporter:
+    """Makes the reported features of the observations of an episode, views included."""
+
+    def __init__(self, config: SimulatorConfig, views: Sequence[View], workspace: Workspace):
+        self._config, self._views, self._workspace = config, views, workspace
+        self.remembers = any(view.memory for view in views)
+        self.start_episode()
+
+    def start_episode(self) -> None:
+        """Forget the frames of the last episode."""
+        self._renderers = [view.start_episode() for view in self._views]
+
+    def __call__(self, raw: RawObservation) -> Observation:
+        """Return the features of an observation."""
+        features, camera = named_features(raw), self._config.camera
+        others = {name: _frame(features, name, self._workspace) for name in other_cameras(self._views, camera)}
+        for render in self._renderers:
+            frame = replace(_frame(features, camera, self._workspace), others=others)
+            for output, image in render(frame).items():
+                features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
+        return {name: features[name] for name in self._config.names}
+
+
+def _frame(features: Observation, camera: str, workspace: Workspace) -> Frame:
+    rgb, depth = features[keys.rgb(camera)], features.get(keys.depth(camera))
+    calibrated = stored_camera(
+        features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
+    )
+    return Frame(rgb, None if depth is None else depth[..., 0], calibrated, workspace, features[keys.STATE])

@@ -19,7 +19,7 @@ from lerobot_symview.datasets.add_views import (
     unit_from_flag,
     views_for_dataset,
 )
-from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
+from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_units
 from lerobot_symview.datasets.features import Features, is_depth_feature
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
@@ -75,7 +75,7 @@ class PreviewConfig:
     pose: PoseReading = field(default_factory=PoseReading)
     """How to read the calibration's pose; by default as its file says, else as the reading that sees the workspace."""
     depth_unit: str | None = None
-    """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
+    """Unit of the cameras' depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
     default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
     workspace: Workspace | None = None
     """Square of the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
@@ -230,7 +230,7 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
     reader = FrameReader(source, config.camera, workspace, read_for, calibration)
     with flagged(f"--camera={config.camera}, --calibration"):
         reader.check()
-        reader = with_depth_unit(reader, unit_from_flag(config.depth_unit))
+        reader = with_depth_units(reader, unit_from_flag(config.depth_unit))
     return reader, views
 
 

@@ -17,7 +17,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.calibration.readings import PoseReading, ReadingError
-from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_unit
+from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_units
 from lerobot_symview.datasets.derivation import (
     Derivation,
     cut_parts,
@@ -56,6 +56,7 @@ EXAMPLES = """\
   symview-add-views --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --num_workers=4 \\
       --reproj.clip=0.15 --reproj.source_scale=2
   symview-add-views --dataset.repo_id=me/real --calibration='[camera_info.yaml, handeye.calib]' --camera=front
+  symview-add-views --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --reproj.cameras='[front, left]'
   symview-add-views --dataset.repo_id=me/picking --new_repo_id=me/stock --size=76 --for_stock_policies=true"""
 
 POSE_FLAGS = {
@@ -79,7 +80,8 @@ class AddViewsConfig:
     views: list[ViewSpec] = field(default_factory=lambda: [ViewSpec("reproj")])
     """Views to add, by name or with options: `[reproj, {name: persp, plane_height: 0.025}]`. reproj needs depth."""
     camera: str = "side"
-    """Camera whose images the views are rendered from."""
+    """Camera whose images the views are rendered from, and under whose name they are stored. A view's option `cameras`
+    merges further ones."""
     size: int | None = None
     """Rows and columns of the views; a size given in `views` takes precedence."""
     reproj: ReprojectedView = field(default_factory=ReprojectedView)
@@ -92,7 +94,7 @@ class AddViewsConfig:
     pose: PoseReading = field(default_factory=PoseReading)
     """How to read the calibration's pose; by default as its file says, else as the reading that sees the workspace."""
     depth_unit: str | None = None
-    """Unit of the camera's depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
+    """Unit of the cameras' depth: m, mm, or metres per unit, such as 0.0001 (RealSense D405) or 0.00025 (L515); by
     default that of the calibration file, else of the dataset, else the one that shows the table at z = 0."""
     workspace: Workspace | None = None
     """Square on the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
@@ -190,14 +192,13 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         config.calibration, config.workspace, source.features, config.camera, config.pose
     )
     views = views_for_dataset(config.make_views(), source.features)
+    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
     added: Features = {}
-    if calibration is not None:
-        with flagged(f"--calibration={_listed(config.calibration)}"):
-            camera = calibration.camera(config.camera)
-            check_camera(config.camera, camera, workspace)
-        added |= calibration_features(
-            config.camera, lens=camera.lens is not None, depth_sensor=camera.depth_sensor is not None
-        )
+    with flagged(f"--calibration={_listed(config.calibration)}"):
+        for name, camera in reader.given_cameras().items():
+            check_camera(name, camera, workspace)
+            has_lens, has_sensor = camera.lens is not None, camera.depth_sensor is not None
+            added |= calibration_features(name, lens=has_lens, depth_sensor=has_sensor)
     for name, view in views.items():
         added |= view_features(config.camera, name, view, workspace)
     kept = config.kept_images()
@@ -206,10 +207,9 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         for key, feature in source.features.items()
         if feature["dtype"] in ("image", "video") and kept is not None and key.removeprefix(keys.IMAGES) not in kept
     ]
-    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
     with flagged(f"--camera={config.camera}, --calibration"):
         reader.check()
-        reader = with_depth_unit(reader, unit_from_flag(config.depth_unit))
+        reader = with_depth_units(reader, unit_from_flag(config.depth_unit))
     _check_names(config, source.features, added)
     source.check_files([key for key in source.features if key not in dropped or key in reader.features()])
     return Derivation(
@@ -220,7 +220,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         views,
         workspace,
         calibration,
-        reader.depth_unit,
+        dict(reader.depth_units),
         dropped,
         added,
         derived_schema(source, dropped, added),
@@ -313,7 +313,7 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "views": {name: asdict(view) for name, view in derivation.views.items()},
             "workspace": asdict(derivation.workspace),
             "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
-            "depth_unit": derivation.depth_unit,
+            "depth_units": derivation.depth_units,
             "left_out": derivation.dropped,
             "symview": version("lerobot_policy_symview"),
         }

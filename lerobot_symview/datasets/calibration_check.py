@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import replace
 
 from lerobot_symview import keys
+from lerobot_symview.calibration.agreement import report_agreement
 from lerobot_symview.calibration.table_plane import TablePlane, check_table, has_depth, likely_depth_unit
 from lerobot_symview.datasets.features import declared_unit
 from lerobot_symview.datasets.frame_reader import FrameReader
@@ -17,28 +19,39 @@ from lerobot_symview.views import Frame
 logger = logging.getLogger(__name__)
 
 
-def with_depth_unit(reader: FrameReader, depth_unit: float | None) -> FrameReader:
-    """Return the reader with the unit of its camera's depth, metres per unit.
+def with_depth_units(reader: FrameReader, depth_unit: float | None) -> FrameReader:
+    """Return the reader with the unit of every camera's depth, metres per unit.
 
     The unit is the argument, else the calibration file's, else the one that the dataset declares. Where none is stated,
     it is the unit in which the first depth image shows the table at z = 0, which is logged; if the table is hidden, the
     reader infers the unit from the values.
     """
-    if not reader.depth:
-        return reader
+    units = {name: _depth_unit(one, depth_unit) for name, one in _by_camera(reader).items() if one.depth}
+    return replace(reader, depth_units={name: unit for name, unit in units.items() if unit is not None})
+
+
+def _depth_unit(reader: FrameReader, depth_unit: float | None) -> float | None:
     key = keys.depth(reader.camera)
     feature = reader.dataset.features[key]
     unit = depth_unit or (reader.calibration.depth_units.get(reader.camera) if reader.calibration else None)
     if unit is None and feature["dtype"] == "image" and declared_unit(feature) is None:
         unit = _unit_by_table(reader, key)
-    return reader if unit is None else replace(reader, depth_unit=unit)
+    return unit
+
+
+def _by_camera(reader: FrameReader) -> dict[str, FrameReader]:
+    """Return the reader and those of the cameras that views merge with its camera, by name."""
+    return {reader.camera: reader, **reader.others}
 
 
 def check_calibration(reader: FrameReader) -> TablePlane | None:
-    """Check camera and depth in the first frame of the first, middle and last episode.
+    """Check every camera and its depth in the first frame of the first, middle and last episode.
+
+    A warning is logged if two cameras that a view merges measure different heights, which the calibration of at least
+    one of them explains.
 
     Returns:
-        The table's plane in the first of these frames that shows it.
+        The table's plane in the first of these frames of the reader's camera that shows it.
 
     Raises:
         CalibrationError: if a camera is below the table, shows the workspace in too few pixels, sees less than 10 % of
@@ -46,8 +59,21 @@ def check_calibration(reader: FrameReader) -> TablePlane | None:
         DatasetError: if no frame has a valid depth pixel in the workspace.
     """
     frames = _first_frames(reader)
+    planes = [_check_camera(reader, frames)]
+    for name, other in reader.others.items():
+        planes.append(_check_camera(other, {episode: frame.others[name] for episode, frame in frames.items()}))
+    frame = next(iter(frames.values()))
+    merged = {reader.camera: frame, **frame.others}
+    depths = {name: one.depth for name, one in merged.items() if one.depth is not None}
+    if len(depths) > 1:
+        cameras = {name: one.camera for name, one in merged.items()}
+        report_agreement(depths, cameras, reader.workspace, frame.gripper_height)
+    return planes[0]
+
+
+def _check_camera(reader: FrameReader, frames: Mapping[int, Frame]) -> TablePlane | None:
     for episode, frame in frames.items():
-        minimum = MINIMUM_VISIBLE if reader.calibration is not None else LEAST_VISIBLE
+        minimum = MINIMUM_VISIBLE if reader.given_camera is not None else LEAST_VISIBLE
         try:
             check_camera(reader.camera, frame.camera, reader.workspace, minimum=minimum)
         except CalibrationError as error:
@@ -62,7 +88,7 @@ def check_calibration(reader: FrameReader) -> TablePlane | None:
     return _check_tables(reader, frames) if reader.depth else None
 
 
-def _check_tables(reader: FrameReader, frames: dict[int, Frame]) -> TablePlane | None:
+def _check_tables(reader: FrameReader, frames: Mapping[int, Frame]) -> TablePlane | None:
     key = keys.depth(reader.camera)
     is_video = reader.dataset.features[key]["dtype"] == "video"
     unit = METRES if is_video else reader.depth_unit or reader.dataset.depth_unit(key)

@@ -49,15 +49,15 @@ class Derivation:
     folder: Path
     """`<target>.partial`."""
     camera: str
-    """Camera whose images the views are rendered from."""
+    """Camera whose images the views are rendered from, and under whose name they are stored."""
     views: dict[str, View]
     """Views to add, by name."""
     workspace: Workspace
     """Square on the table that the views show."""
     calibration: Calibration | None
-    """Calibration of the camera if it is not in the source; it is added to the result."""
-    depth_unit: float | None
-    """Metres per unit of the camera's depth; None as the source declares."""
+    """Calibration of the cameras that is not in the source; it is added to the result."""
+    depth_units: dict[str, float]
+    """Camera -> metres per unit of its depth; others as the source declares."""
     dropped: list[str]
     """Keys of the source features that are not copied."""
     added: Features
@@ -76,7 +76,7 @@ class Derivation:
 
     def reader(self, source: SourceDataset) -> FrameReader:
         """Return a reader of the frames that the views are rendered from."""
-        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration, self.depth_unit)
+        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration, self.depth_units)
 
     def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
         """Return `rgb` or `height` for every new image feature."""
@@ -181,16 +181,17 @@ def _render(
     """Render an episode; return its new columns and the statistics of its new images."""
     kinds, statistics = derivation.image_kinds(), derivation.no_statistics()
     encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
+    renderers = [view.start_episode() for view in derivation.views.values()]
     for frame in reader.frames(episode, table):
-        for view in derivation.views.values():
-            for output, image in view.render(frame).items():
+        for render in renderers:
+            for output, image in render(frame).items():
                 key = keys.view(derivation.camera, output)
                 statistics[key].add(image)
                 encoded[key].append(encode_rgb(image) if kinds[key] == "rgb" else encode_metres(image))
     columns: dict[str, pa.Array] = {}
     for key, images in encoded.items():
         columns[key] = image_column(images, "png" if kinds[key] == "rgb" else "tiff")
-    for key, values in _added_vectors(derivation).items():
+    for key, values in _added_vectors(reader).items():
         flat = pa.array(np.tile(values, len(table)))
         columns[key] = pa.FixedSizeListArray.from_arrays(flat, len(values))
     return columns, statistics
@@ -202,18 +203,18 @@ def image_column(images: list[bytes], extension: str) -> pa.StructArray:
     return pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
 
 
-def _added_vectors(derivation: Derivation) -> dict[str, np.ndarray]:
+def _added_vectors(reader: FrameReader) -> dict[str, np.ndarray]:
     """Return the calibration that is added to the result, flattened float32, by feature key."""
-    if derivation.calibration is None:
-        return {}
-    camera = derivation.calibration.camera(derivation.camera)
-    numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
-    if camera.lens is not None:
-        numbers[keys.distortion] = camera.lens.stored()
-    if camera.depth_sensor is not None:
-        numbers[keys.depth_intrinsics] = camera.depth_sensor.intrinsics
-        numbers[keys.color_from_depth] = camera.depth_sensor.color_from_depth
-    return {key(derivation.camera): values.astype(np.float32).ravel() for key, values in numbers.items()}
+    vectors: dict[str, np.ndarray] = {}
+    for name, camera in reader.given_cameras().items():
+        numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
+        if camera.lens is not None:
+            numbers[keys.distortion] = camera.lens.stored()
+        if camera.depth_sensor is not None:
+            numbers[keys.depth_intrinsics] = camera.depth_sensor.intrinsics
+            numbers[keys.color_from_depth] = camera.depth_sensor.color_from_depth
+        vectors |= {key(name): values.astype(np.float32).ravel() for key, values in numbers.items()}
+    return vectors
 
 
 def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
@@ -265,7 +266,7 @@ def _collect_statistics(
     lengths = [row["length"] for row in source.episodes]
     collected = {key: image_summary(total.summary(), total.images) for key, total in totals.items()}
     of_episodes = {key: image_summary(np.concatenate(values), lengths) for key, values in summaries.items()}
-    for key, values in _added_vectors(derivation).items():
+    for key, values in _added_vectors(derivation.reader(source)).items():
         collected[key] = constant_summary(values, sum(lengths))
         each = [constant_summary(values, length) for length in lengths]
         of_episodes[key] = {name: [summary[name] for summary in each] for name in each[0]}

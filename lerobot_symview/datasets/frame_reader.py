@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import islice, repeat
 from typing import Any
 
@@ -17,20 +17,21 @@ from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vector
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import Frame, View
+from lerobot_symview.views import Frame, View, other_cameras
 
 
 @dataclass(frozen=True)
 class FrameReader:
-    """Reader of one camera's frames.
+    """Reader of one camera's frames, and of the cameras that views merge with it.
 
     Args:
         dataset: the dataset.
         camera: name of the camera.
         workspace: the square on the table that views show.
-        views: the views to render; they determine whether depth and the gripper's state are read.
-        calibration: calibration of the camera if it is not in the dataset.
-        depth_unit: metres per unit of the camera's depth; by default what the dataset declares, or its values suggest.
+        views: the views to render; they determine whether depth, the gripper's state and further cameras are read.
+        calibration: calibration of the camera, and of further ones, if it is not in the dataset.
+        depth_units: camera -> metres per unit of its depth; by default what the dataset declares, or its values
+            suggest.
     """
 
     dataset: SourceDataset
@@ -38,7 +39,40 @@ class FrameReader:
     workspace: Workspace
     views: Collection[View]
     calibration: Calibration | None = None
-    depth_unit: float | None = None
+    depth_units: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def others(self) -> dict[str, FrameReader]:
+        """The readers of the cameras that views merge with this one, by name."""
+        readers = {}
+        for name in other_cameras(self.views, self.camera):
+            alone: list[Any] = [replace(view, cameras=()) for view in self.views if name in view.cameras]
+            readers[name] = replace(self, camera=name, views=alone)
+        return readers
+
+    @property
+    def depth_unit(self) -> float | None:
+        """Metres per unit of the camera's depth; None if it is what the dataset declares, or its values suggest."""
+        return self.depth_units.get(self.camera)
+
+    @property
+    def given_camera(self) -> Camera | None:
+        """The camera by `calibration`; None if its calibration is in the dataset alone.
+
+        Raises:
+            CalibrationError: if it is in neither.
+        """
+        if self.calibration is None:
+            return None
+        is_stored = keys.intrinsics(self.camera) in self.dataset.features
+        if is_stored and self.camera not in self.calibration.cameras:
+            return None
+        return self.calibration.camera(self.camera)
+
+    def given_cameras(self) -> dict[str, Camera]:
+        """Return the cameras whose calibration is by `calibration`, of this one and those merged with it, by name."""
+        cameras = {reader.camera: reader.given_camera for reader in (self, *self.others.values())}
+        return {name: camera for name, camera in cameras.items() if camera is not None}
 
     @property
     def depth(self) -> bool:
@@ -52,10 +86,16 @@ class FrameReader:
 
     def features(self) -> list[str]:
         """Return the keys of the features that `frames` requires."""
+        required = self._own_features()
+        for other in self.others.values():
+            required += other.features()
+        return list(dict.fromkeys(required))
+
+    def _own_features(self) -> list[str]:
         required = [keys.rgb(self.camera), "timestamp"]
         required += [keys.depth(self.camera)] if self.depth else []
         required += [keys.STATE] if self.gripper else []
-        if self.calibration is None:
+        if self.given_camera is None:
             required += self._calibration()
         return required
 
@@ -65,19 +105,22 @@ class FrameReader:
 
     def _has_depth_sensor(self) -> bool:
         """Return whether depth has a calibration of its own, and thus a size and place of its own."""
-        if self.calibration is None:
+        camera = self.given_camera
+        if camera is None:
             return keys.depth_intrinsics(self.camera) in self._calibration()
-        return self.calibration.camera(self.camera).depth_sensor is not None
+        return camera.depth_sensor is not None
 
     def columns(self) -> list[str]:
         """Return the table columns that `frames` reads: its features except videos."""
-        features = self.dataset.features
-        return [key for key in self.features() if features.get(key, {}).get("dtype") != "video"]
+        return [key for key in self.features() if not self._is_video(key)]
+
+    def _is_video(self, key: str) -> bool:
+        return bool(self.dataset.features.get(key, {}).get("dtype") == "video")
 
     def check(self) -> None:
         """Raise a DatasetError that lists the required features that the dataset lacks."""
         features = self.dataset.features
-        missing = [key for key in self.columns() if key not in features]
+        missing = [key for key in self._own_features() if key not in features and not self._is_video(key)]
         depth = keys.depth(self.camera)
         if self.depth and depth in features and not is_depth_feature(features[depth]):
             missing.append(f"{depth} as a depth feature")
@@ -88,6 +131,8 @@ class FrameReader:
             raise DatasetError(
                 f"the dataset lacks {', '.join(missing)}; cameras with calibration: {', '.join(cameras) or 'none'}"
             )
+        for other in self.others.values():
+            other.check()
 
     def frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
         """Yield the frames of an episode; `table` holds its rows.
@@ -95,6 +140,11 @@ class FrameReader:
         Raises:
             CalibrationError: if a frame's calibration is invalid.
         """
+        others = {name: reader.frames(episode, table) for name, reader in self.others.items()}
+        for frame in self._own_frames(episode, table):
+            yield replace(frame, others={name: next(frames) for name, frames in others.items()}) if others else frame
+
+    def _own_frames(self, episode: int, table: pa.Table) -> Iterator[Frame]:
         colors = self.dataset.images(keys.rgb(self.camera), episode, table)
         depths: Iterator[Any] = repeat(None)
         if self.depth:
@@ -103,7 +153,7 @@ class FrameReader:
         if self.gripper:
             states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
         calibrations: Iterator[Any] = repeat(None)
-        if self.calibration is None:
+        if self.given_camera is None:
             names = [keys.parameter(key) for key in self._calibration()]
             columns = zip(*(vectors(table, key) for key in self._calibration()), strict=True)
             calibrations = (dict(zip(names, numbers, strict=True)) for numbers in columns)
@@ -125,8 +175,8 @@ class FrameReader:
     def _camera(self, stored: dict[str, NDArray] | None, height: int, width: int) -> Camera:
         if stored is not None:
             return stored_camera(height=height, width=width, **stored)
-        assert self.calibration is not None
-        camera = self.calibration.camera(self.camera)
+        camera = self.given_camera
+        assert camera is not None
         if (camera.height, camera.width) != (height, width):
             raise CalibrationError(
                 f"the calibration is for {camera.height} x {camera.width} pixels, the images have {height} x {width}"

@@ -46,17 +46,22 @@ def without_smear(
     Returns:
         (P, P) int32.
     """
-    if camera.lens is not None:
-        depth = cv2.remap(np.asarray(depth, np.float32), *_maps(camera.optics), cv2.INTER_NEAREST)
     pixels = len(shown)
     position = workspace.pixel_from_xy(camera.position[None, :2], pixels)[0] + 0.5
     chosen = shown.copy()
-    _replace(chosen, *buffer, np.ascontiguousarray(depth), _image_from_grid(camera, workspace, pixels), position)
+    _replace(chosen, *buffer, pinhole_depth(depth, camera), image_from_grid(camera, workspace, pixels), position)
     return chosen
 
 
+def pinhole_depth(depth: NDArray[np.floating], camera: Camera) -> NDArray[np.floating]:
+    """Return the depth image of a camera's ideal pixels: of the pinhole camera with the same K and size."""
+    if camera.lens is None:
+        return np.ascontiguousarray(depth)
+    return np.asarray(cv2.remap(np.asarray(depth, np.float32), *_maps(camera.optics), cv2.INTER_NEAREST))
+
+
 @lru_cache(maxsize=64)
-def _image_from_grid(camera: Camera, workspace: Workspace, pixels: int) -> Array:
+def image_from_grid(camera: Camera, workspace: Workspace, pixels: int) -> Array:
     """Return (3, 4): (row, column, height, 1), rows and columns from the grid's edge, to depth times (u, v, 1)."""
     cell = workspace.size / pixels
     world_from_grid = np.diag([cell, cell, 1.0, 1.0])
@@ -76,17 +81,23 @@ def _maps(optics: Optics) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @njit(cache=True, nogil=True)
-def _looks_through(depth, matrix, row, column, height):  # type: ignore[no-untyped-def]
-    """Whether the camera measured a surface behind the point at a (row, column) of the grid and a height."""
+def measured_at(depth, matrix, row, column, height):  # type: ignore[no-untyped-def]
+    """Distance of a grid point, (row, column, height), and the depth of its pixel; 0 depth outside of the image."""
     distance = matrix[2, 0] * row + matrix[2, 1] * column + matrix[2, 2] * height + matrix[2, 3]
     if not distance > 0.0:
-        return False
+        return distance, 0.0
     u = (matrix[0, 0] * row + matrix[0, 1] * column + matrix[0, 2] * height + matrix[0, 3]) / distance + 0.5
     v = (matrix[1, 0] * row + matrix[1, 1] * column + matrix[1, 2] * height + matrix[1, 3]) / distance + 0.5
     rows, columns = depth.shape
     if not (u >= 0.0 and v >= 0.0 and u < columns and v < rows):
-        return False
-    measured = depth[int(v), int(u)]
+        return distance, 0.0
+    return distance, float(depth[int(v), int(u)])
+
+
+@njit(cache=True, nogil=True)
+def _looks_through(depth, matrix, row, column, height):  # type: ignore[no-untyped-def]
+    """Whether the camera measured a surface behind the point at a (row, column) of the grid and a height."""
+    distance, measured = measured_at(depth, matrix, row, column, height)
     return measured < np.inf and measured > distance + SEE_THROUGH
 
 

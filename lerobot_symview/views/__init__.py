@@ -8,6 +8,7 @@ from lerobot_symview.views.base import (
     check_gripper,
     make_view,
     make_views,
+    other_cameras,
     register_view,
 )
 from lerobot_symview.views.perspective import PerspectiveView, warp_table
@@ -24,6 +25,7 @@ __all__ = [
     "check_gripper",
     "make_view",
     "make_views",
+    "other_cameras",
     "register_view",
     "reproject",
     "warp_table",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
 
@@ -43,7 +43,8 @@ class Frame:
         workspace: the square on the table that views show.
         gripper: (5,) float: x, y (metres, relative to the workspace centre), z (metres), yaw (rad), aperture in
             [0, 1]; None if unknown: then no point is clipped and no gripper image is drawn.
-        others: frames of further cameras at the same time step, over the same workspace; their gripper is not used.
+        others: frames of further cameras at the same time step and over the same workspace, by the camera's name, for
+            views that merge cameras; their gripper is not used.
 
     Raises:
         ValueError: if an image's shape or dtype is wrong, the gripper's state is not finite, or another frame has
@@ -56,7 +57,7 @@ class Frame:
     camera: Camera
     workspace: Workspace
     gripper: NDArray[np.floating] | None = None
-    others: tuple[Frame, ...] = ()
+    others: Mapping[str, Frame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_above_table(self.camera)
@@ -70,7 +71,7 @@ class Frame:
             )
         if self.gripper is not None:
             check_gripper(self.gripper.tolist())
-        if any(other.workspace != self.workspace for other in self.others):
+        if any(other.workspace != self.workspace for other in self.others.values()):
             raise ValueError("the frames of several cameras must have one workspace")
 
     @property
@@ -99,6 +100,8 @@ class View(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     size: int  # rows and columns of every output
+    cameras: tuple[str, ...] = ()  # cameras whose images the view merges with its own camera's
+    memory: bool = False  # whether an image depends on the earlier frames of the episode
 
     @property
     @abstractmethod
@@ -119,9 +122,21 @@ class View(ABC):
     def render(self, frame: Frame) -> dict[str, NDArray]:
         """Return one image for each entry of `outputs`."""
 
+    def start_episode(self) -> Callable[[Frame], dict[str, NDArray]]:
+        """Return a function that renders the frames of one episode in order, for views that remember earlier ones."""
+        return self.render
+
     def without_gripper(self) -> Self:
         """Return the variant of the view for frames without the gripper's state."""
         return self
+
+    def merged(self, frame: Any) -> list[Any]:
+        """Return the frames that the view merges: that of its own camera, and those of `cameras` that are there.
+
+        Args:
+            frame: a `Frame`, or a `FrameBatch` (`lerobot_symview.views.torch_backend`).
+        """
+        return [frame, *(frame.others[name] for name in self.cameras if name in frame.others)]
 
     def with_mask(self) -> Self:
         """Return the variant of the view that also outputs a mask of measured pixels, if the view supports one."""
@@ -242,6 +257,11 @@ def make_views(specs: Iterable[ViewSpec]) -> dict[str, View]:
     return views
 
 
+def other_cameras(views: Iterable[View], camera: str) -> list[str]:
+    """Return the names of the cameras that views of `camera` merge with it."""
+    return list(dict.fromkeys(name for view in views for name in view.cameras if name != camera))
+
+
 def gray_to_rgb(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Convert a grey image (H, W) uint8 to three equal channels (H, W, 3)."""
     return np.asarray(cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
@@ -251,3 +271,17 @@ def check_size(size: int) -> None:
     """Raise an OptionError unless `size` is a valid number of rows and columns of a view."""
     if not isinstance(size, Integral) or not SMALLEST <= size <= LARGEST:
         raise OptionError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")
+
+
+def checked_cameras(cameras: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the cameras that a view merges as a tuple.
+
+    Raises:
+        OptionError: if they are no names, or a name is given twice.
+    """
+    if isinstance(cameras, str) or not all(isinstance(name, str) and name for name in cameras):
+        raise OptionError(f"cameras must be a list of names, such as [side, left], got {cameras!r}")
+    names = tuple(cameras)
+    if len(set(names)) < len(names):
+        raise OptionError(f"cameras must differ, got {', '.join(names)}")
+    return names

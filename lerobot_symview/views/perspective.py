@@ -14,7 +14,7 @@ from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import inside_image, pixel_density, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views.base import Frame, Kind, View, check_size, gray_to_rgb
+from lerobot_symview.views.base import Frame, Kind, View, check_size, checked_cameras, gray_to_rgb
 
 
 def warp_table(
@@ -43,11 +43,12 @@ def warp_table(
         ValueError: if an image's shape or dtype is wrong, the plane lies partly behind a camera, or lists differ in
             length.
     """
-    view = PerspectiveView(size=size, plane_height=plane_height, gripper=False)
     if isinstance(camera, Camera):
         rgb, camera = [rgb], [camera]  # type: ignore[list-item]
     frame, *others = [Frame(color, None, one, workspace) for color, one in zip(rgb, camera, strict=True)]
-    return view.render(replace(frame, others=tuple(others)))["persp"]
+    further = {str(number): other for number, other in enumerate(others, start=2)}
+    view = PerspectiveView(size, plane_height, gripper=False, cameras=tuple(further))
+    return view.render(replace(frame, others=further))["persp"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,9 @@ class PerspectiveView(View):
     gripper: bool = True
     """Add `persp_gripper` if the gripper's state is known: the fingers as squares whose brightness is the gripper's
     height."""
+    cameras: tuple[str, ...] = ()
+    """Cameras whose images the view merges, such as `[side, left]`: each pixel shows the camera that has the most
+    pixels of that part of the plane. The view's own camera is always one of them."""
 
     @property
     def outputs(self) -> dict[str, Kind]:
@@ -77,6 +81,7 @@ class PerspectiveView(View):
 
     def __post_init__(self) -> None:
         check_size(self.size)
+        object.__setattr__(self, "cameras", checked_cameras(self.cameras))  # frozen; JSON has lists
         if self.plane_height != "gripper" and (
             isinstance(self.plane_height, str) or not math.isfinite(self.plane_height)
         ):
@@ -111,11 +116,12 @@ class PerspectiveView(View):
 
     def _warped(self, frame: Frame, plane_height: float) -> NDArray[np.uint8]:
         """Return the warped image (size, size, 3) uint8; of several cameras, by the best at each pixel."""
-        warps = [
-            (warp_map(one.camera, frame.workspace, self.size, plane_height), one) for one in (frame, *frame.others)
-        ]
+        frames = self.merged(frame)
+        if len(frames) > 1:
+            frames = [one for one in frames if one.rgb.any()] or [frame]  # a camera that delivers nothing is black
+        warps = [(warp_map(one.camera, frame.workspace, self.size, plane_height), one) for one in frames]
         images = [warp_plane(one.rgb, warp) for warp, one in warps]
-        if not frame.others:
+        if len(images) == 1:
             return images[0]
         density = [
             np.where(

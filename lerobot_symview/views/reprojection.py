@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from numbers import Integral
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,10 @@ from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera, aligned_depth
 from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, gray_to_rgb
+from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, checked_cameras, gray_to_rgb
+
+if TYPE_CHECKING:
+    from lerobot_symview.geometry.memory import Memory
 
 INFILLS = ("nearest", "occlusion", "local", "none")
 
@@ -81,7 +84,6 @@ def reproject(
         top.rgb  # (152, 152, 3)
         ```
     """
-    view = ViewSpec("reproj", options | {"height": True, "mask": True}).make()
     gripper = None if gripper is None else np.asarray(gripper)
     if isinstance(camera, Camera):
         rgb, depth, camera = [rgb], [depth], [camera]  # type: ignore[list-item]
@@ -89,7 +91,9 @@ def reproject(
         Frame(color, aligned_depth(in_metres(distance), one), one, workspace, gripper)
         for color, distance, one in zip(rgb, depth, camera, strict=True)
     ]
-    images = view.render(replace(frame, others=tuple(others)))
+    further = {str(number): other for number, other in enumerate(others, start=2)}
+    view = ViewSpec("reproj", options | {"height": True, "mask": True, "cameras": tuple(further)}).make()
+    images = view.render(replace(frame, others=further))
     return Reprojection(images["reproj"], images["reproj_height"], images["reproj_seen"][..., 0] > 0)
 
 
@@ -118,6 +122,13 @@ class ReprojectedView(View):
     """Add `reproj_height`: metres above the table, one channel, which LeRobot's own policies do not accept."""
     mask: bool = False
     """Add `reproj_seen`: white where the camera measured a point, black where the image is infilled."""
+    cameras: tuple[str, ...] = ()
+    """Cameras whose images the view merges, such as `[side, left]`: each cell shows its highest surface, by the camera
+    that has the most pixels of it. The view's own camera is always one of them."""
+    memory: bool = False
+    """Show what is hidden as it was when it was last seen in the episode."""
+    age: bool = False
+    """Add `reproj_age`: frames since a remembered pixel was last seen, 0 for seen ones, 255 for infilled ones."""
 
     @property
     def outputs(self) -> dict[str, Kind]:
@@ -127,6 +138,8 @@ class ReprojectedView(View):
             outputs["reproj_height"] = "height"
         if self.mask:
             outputs["reproj_seen"] = "rgb"
+        if self.age:
+            outputs["reproj_age"] = "rgb"
         return outputs
 
     @property
@@ -141,6 +154,7 @@ class ReprojectedView(View):
 
     def __post_init__(self) -> None:
         check_size(self.size)
+        object.__setattr__(self, "cameras", checked_cameras(self.cameras))  # frozen; JSON has lists
         if self.infill not in INFILLS:
             raise OptionError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
         if self.clip not in ("gripper", "none") and (isinstance(self.clip, str) or not self.clip > -math.inf):
@@ -150,6 +164,8 @@ class ReprojectedView(View):
         for name, metres in {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor}.items():
             if not math.isfinite(metres):
                 raise OptionError(f"{name} must be finite metres, got {metres}")
+        if self.age and not self.memory:
+            raise OptionError("age is that of remembered pixels: it needs memory=true")
         if not isinstance(self.source_scale, Integral) or not 1 <= self.source_scale <= 8:
             raise OptionError(f"source_scale must be an integer from 1 to 8, got {self.source_scale}")
 
@@ -161,32 +177,64 @@ class ReprojectedView(View):
         """Return the view with the output `reproj_seen`."""
         return replace(self, mask=True)
 
+    def start_episode(self) -> Callable[[Frame], dict[str, NDArray]]:
+        """Return a function that renders the frames of one episode in order; with `memory`, it remembers them."""
+        if not self.memory:
+            return self.render
+        remembered: list[Memory | None] = [None]
+
+        def render(frame: Frame) -> dict[str, NDArray]:
+            images, remembered[0] = self._render(frame, remembered[0])
+            return images
+
+        return render
+
     def render(self, frame: Frame) -> dict[str, NDArray]:
-        """Return the outputs; black and height 0 where no point was measured or infilled."""
+        """Return the outputs; black and height 0 where no point was measured or infilled.
+
+        With `memory`, the frame is the first of an episode.
+        """
+        return self._render(frame, None)[0]
+
+    def _render(self, frame: Frame, memory: Memory | None) -> tuple[dict[str, NDArray], Memory | None]:
+        """Return the outputs and, with the option, the memory of the episode after this frame."""
         from lerobot_symview.geometry import fusion, infill, occlusion, zbuffer  # slow import: numba
+        from lerobot_symview.geometry.memory import Memory, recall
 
         ceiling = self.ceiling(frame.gripper_height)
-        sources = [self._source(one) for one in (frame, *frame.others)]
+        sources = [self._source(one) for one in self.merged(frame)]
         buffers = [
             zbuffer.zbuffer_from_depth(source.depth, source.camera, frame.workspace, self.size, ceiling)
             for source in sources
         ]
         buffer = buffers[0]
-        if frame.others:
+        if len(buffers) > 1:
             buffer = fusion.fuse_buffers(buffers, [source.camera for source in sources], frame.workspace)
-        seen = buffer.source != zbuffer.EMPTY
+        seen = known = buffer.source != zbuffer.EMPTY
+        colors_of = [source.rgb for source in sources]
+        age = None
+        if self.memory:
+            depths, cameras = [source.depth for source in sources], [source.camera for source in sources]
+            buffer, age = recall(memory, buffer, depths, cameras, frame.workspace, frame.gripper)
+            colors_of += [] if memory is None else [memory.rgb]
+            known = buffer.source != zbuffer.EMPTY
         is_nearest = self.infill in ("nearest", "occlusion")
-        shown = infill.nearest_known(seen) if is_nearest else _identity_cells(self.size)
+        shown = infill.nearest_known(known) if is_nearest else _identity_cells(self.size)
         if self.infill == "occlusion":
             for source in sources:
                 shown = occlusion.without_smear(shown, buffer, source.depth, source.camera, frame.workspace)
-        colors, height = zbuffer.gather(shown, buffer, [source.rgb for source in sources])
+        colors, height = zbuffer.gather(shown, buffer, colors_of)
         if self.infill == "local":
-            colors, height = infill.fill_local(colors, seen), infill.fill_local(height, seen)
+            colors, height = infill.fill_local(colors, known), infill.fill_local(height, known)
         images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
         if self.mask:
             images["reproj_seen"] = gray_to_rgb(seen.astype(np.uint8) * np.uint8(255))
-        return {output: images[output] for output in self.outputs}
+        if age is None:
+            return {output: images[output] for output in self.outputs}, None
+        if self.age:
+            images["reproj_age"] = gray_to_rgb(np.where(age < 0, 255, np.minimum(age, 254)).astype(np.uint8))
+        remembered = Memory(*zbuffer.gather(_identity_cells(self.size), buffer, colors_of), age)
+        return {output: images[output] for output in self.outputs}, remembered
 
     def _source(self, frame: Frame) -> _Source:
         """Return a frame's images and camera, without flying pixels and upsampled, as the options say."""

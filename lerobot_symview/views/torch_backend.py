@@ -7,7 +7,8 @@ computed on the CPU, once, and kept on the device.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -15,8 +16,9 @@ import torch
 from torch import Tensor
 
 from lerobot_symview.geometry.camera import Camera, Optics, ideal_pixels
+from lerobot_symview.geometry.fusion import SAME_SURFACE
 from lerobot_symview.geometry.gripper import gripper_image
-from lerobot_symview.geometry.homography import warp_map
+from lerobot_symview.geometry.homography import inside_image, pixel_density, warp_map
 from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.geometry.zbuffer import EMPTY, grid_from_pixel
@@ -37,9 +39,11 @@ class FrameBatch:
         cameras: B calibrated cameras.
         workspace: the square on the table that the views show.
         gripper: (B, 5) float32, as in `Frame`; None if unknown.
+        others: the same frames of further cameras, of any size, by the camera's name.
 
     Raises:
-        ValueError: if the number of cameras is not B, an image's size differs from its camera's, or a dtype is wrong.
+        ValueError: if the number of cameras is not B, another camera has not B frames of the same workspace, an image's
+            size differs from its camera's, or a dtype is wrong.
         CalibrationError: if a camera is below the table.
     """
 
@@ -48,6 +52,7 @@ class FrameBatch:
     cameras: list[Camera]
     workspace: Workspace
     gripper: Tensor | None = None
+    others: Mapping[str, FrameBatch] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count, rows, columns = len(self.rgb), *self.rgb.shape[-2:]
@@ -57,6 +62,8 @@ class FrameBatch:
             check_above_table(camera)
         if len(self.cameras) != count:
             raise ValueError(f"{count} frames need {count} cameras, got {len(self.cameras)}")
+        if any(len(other.rgb) != count or other.workspace != self.workspace for other in self.others.values()):
+            raise ValueError(f"the batches of several cameras must have {count} frames of one workspace")
         sizes = {(camera.height, camera.width) for camera in self.cameras}
         if sizes - {(rows, columns)}:
             raise ValueError(f"rgb has {rows} x {columns} pixels, the cameras have {sorted(sizes)}")
@@ -70,9 +77,12 @@ class FrameBatch:
 
 
 def can_batch(view: View) -> bool:
-    """Whether `render_batch` supports this view: infill `nearest` or `none`, `source_scale` 1, no third-party views."""
+    """Whether `render_batch` supports this view.
+
+    It does for infill `nearest` or `none` and `source_scale` 1, but not with memory, and for no third-party views.
+    """
     if isinstance(view, ReprojectedView):
-        return view.infill in ("nearest", "none") and view.source_scale == 1
+        return view.infill in ("nearest", "none") and view.source_scale == 1 and not view.memory
     return isinstance(view, PerspectiveView)
 
 
@@ -84,8 +94,6 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
     """
     if not can_batch(view):
         raise ValueError(f"{view} can be rendered frame by frame only")
-    if view.needs_depth and batch.depth is None:
-        raise ValueError("the view needs depth")
     if isinstance(view, ReprojectedView):
         images = _reproject(view, batch)
     else:
@@ -95,11 +103,10 @@ def render_batch(view: View, batch: FrameBatch) -> dict[str, Tensor]:
 
 
 def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
-    assert batch.depth is not None
-    depth = without_flying_pixels_batch(batch.depth, view.flying_limit) if view.flying_limit else batch.depth
-    height, source = zbuffer_batch(
-        depth, batch.cameras, batch.workspace, view.size, [view.ceiling(z) for z in _gripper_heights(batch)]
-    )
+    ceilings = [view.ceiling(z) for z in _gripper_heights(batch)]
+    batches = view.merged(batch)
+    buffers = [_zbuffers(view, one, ceilings) for one in batches]
+    height, source = buffers[0] if len(buffers) == 1 else _fused(buffers, batches, view.size)
     seen = source != EMPTY
     if view.infill == "nearest":
         nearest = nearest_known_batch(seen).flatten(1)
@@ -107,12 +114,45 @@ def _reproject(view: ReprojectedView, batch: FrameBatch) -> dict[str, Tensor]:
         source = source.flatten(1).gather(1, nearest).view_as(source)
     known = (source != EMPTY)[:, None]
     pixels = source.clamp(min=0).flatten(1)[:, None].expand(-1, 3, -1)
-    colors = batch.rgb.flatten(2).gather(2, pixels).view(len(source), 3, view.size, view.size)
+    rgb = torch.cat([one.rgb.flatten(2) for one in batches], dim=2) if len(batches) > 1 else batch.rgb.flatten(2)
+    colors = rgb.gather(2, pixels).view(len(source), 3, view.size, view.size)
     return {
         "reproj": torch.where(known, colors, colors.new_zeros(())),
         "reproj_height": height,
         "reproj_seen": (seen.to(torch.uint8) * 255)[:, None].expand(-1, 3, -1, -1),
     }
+
+
+def _zbuffers(view: ReprojectedView, batch: FrameBatch, ceilings: list[float]) -> tuple[Tensor, Tensor]:
+    if batch.depth is None:
+        raise ValueError("the view needs depth")
+    depth = without_flying_pixels_batch(batch.depth, view.flying_limit) if view.flying_limit else batch.depth
+    return zbuffer_batch(depth, batch.cameras, batch.workspace, view.size, ceilings)
+
+
+def _fused(
+    buffers: Sequence[tuple[Tensor, Tensor]], batches: Sequence[FrameBatch], pixels: int
+) -> tuple[Tensor, Tensor]:
+    """Return heights and sources of several cameras' z-buffers, as `fuse_buffers` does."""
+    height, source = (torch.zeros_like(buffers[0][0]), torch.full_like(buffers[0][1], EMPTY))
+    density, first = torch.zeros_like(height), 0
+    for (heights, sources), batch in zip(buffers, batches, strict=True):
+        densities = _densities(batch, pixels, [0.0] * len(batch.rgb))
+        # As the compiled kernel: a float32 difference against a Python number, which is float64.
+        rise = (heights - height).double()
+        is_better = (rise >= -SAME_SURFACE) & (densities > density)
+        taken = (sources != EMPTY) & ((source == EMPTY) | (rise > SAME_SURFACE) | is_better)
+        height, density = torch.where(taken, heights, height), torch.where(taken, densities, density)
+        source = torch.where(taken, first + sources, source)
+        first += batch.rgb.shape[-2] * batch.rgb.shape[-1]
+    return height, source
+
+
+def _densities(batch: FrameBatch, pixels: int, plane_heights: Sequence[float]) -> Tensor:
+    """Return the `pixel_density` of each frame's camera, (B, pixels, pixels) float32."""
+    planes = zip(batch.cameras, plane_heights, strict=True)
+    density = np.stack([pixel_density(camera, batch.workspace, pixels, height) for camera, height in planes])
+    return torch.from_numpy(density).to(batch.rgb.device)
 
 
 def without_flying_pixels_batch(depth: Tensor, limit: float) -> Tensor:
@@ -219,6 +259,33 @@ def nearest_known_batch(known: Tensor) -> Tensor:
 
 def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
     heights = [view.plane(z) for z in _gripper_heights(batch)]
+    images = {"persp": _warped(view, batch, heights)}
+    if view.gripper and batch.gripper is not None:
+        drawn = gripper_image(batch.gripper.double(), batch.workspace, view.size)
+        grey = torch.round(255 * drawn.clamp(0.0, 1.0)).to(torch.uint8)
+        images["persp_gripper"] = grey[:, None].expand(-1, 3, -1, -1)
+    return images
+
+
+def _warped(view: PerspectiveView, batch: FrameBatch, heights: list[float]) -> Tensor:
+    """Return the warped images (B, 3, size, size) uint8; of several cameras, by the best at each pixel."""
+    batches = view.merged(batch)
+    images = [_warped_alone(view, one, heights) for one in batches]
+    if len(images) == 1:
+        return images[0][0]
+    shown = [
+        inside & (one.rgb > 0).flatten(1).any(1)[:, None, None]
+        for one, (_, inside) in zip(batches, images, strict=True)
+    ]
+    density = [
+        torch.where(mask, _densities(one, view.size, heights), -1.0) for one, mask in zip(batches, shown, strict=True)
+    ]
+    best = torch.stack(density).argmax(0)[None, :, None].expand(-1, -1, 3, -1, -1)
+    return torch.stack([image for image, _ in images]).gather(0, best)[0]
+
+
+def _warped_alone(view: PerspectiveView, batch: FrameBatch, heights: list[float]) -> tuple[Tensor, Tensor]:
+    """Return one camera's warped images (B, 3, size, size) uint8, and where they are inside its image."""
     maps = [
         warp_map(camera, batch.workspace, view.size, height)
         for camera, height in zip(batch.cameras, heights, strict=True)
@@ -236,12 +303,8 @@ def _warp(view: PerspectiveView, batch: FrameBatch) -> dict[str, Tensor]:
         color = batch.rgb.flatten(2).gather(2, index).view_as(total).long()
         weight = (right if dx else FRACTION - right) * (down if dy else FRACTION - down)
         total += torch.where(inside, weight, 0)[:, None] * color
-    images = {"persp": ((total + FRACTION**2 // 2) // FRACTION**2).to(torch.uint8)}
-    if view.gripper and batch.gripper is not None:
-        drawn = gripper_image(batch.gripper.double(), batch.workspace, view.size)
-        grey = torch.round(255 * drawn.clamp(0.0, 1.0)).to(torch.uint8)
-        images["persp_gripper"] = grey[:, None].expand(-1, 3, -1, -1)
-    return images
+    in_image = np.stack([inside_image(warp, camera) for warp, camera in zip(maps, batch.cameras, strict=True)])
+    return ((total + FRACTION**2 // 2) // FRACTION**2).to(torch.uint8), torch.from_numpy(in_image).to(device)
 
 
 def _gripper_heights(batch: FrameBatch) -> list[float | None]:

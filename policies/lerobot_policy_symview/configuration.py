@@ -23,7 +23,7 @@ from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
 from lerobot_symview.runtime.cli import flagged
 from lerobot_symview.runtime.flag_errors import flag_errors
-from lerobot_symview.views import VIEWS, View, ViewSpec
+from lerobot_symview.views import VIEWS, View, ViewSpec, other_cameras
 
 CAMERA_IMAGES = ("side", "top")  # a camera's own image in place of a view
 POINT_ENCODERS = ("voxel", "point_cloud")  # lift the camera's image to points in space
@@ -39,7 +39,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "dtype": ("float32", "bfloat16"),
     "learning_rate_decay": ("none", "cosine"),
 }
-UNUSED_OUTPUTS = {"reproj": {"mask": False}, "persp": {"gripper": False}}
+UNUSED_OUTPUTS = {"reproj": {"mask": False, "age": False}, "persp": {"gripper": False}}
 
 
 def from_method() -> Any:
@@ -77,7 +77,7 @@ class SymviewConfig(PreTrainedConfig):
     camera_rays: bool = from_method()
     """Give every pixel of the camera's own image its ray in the world, six Plücker coordinates; plain encoder only."""
     camera: str = "side"
-    """Camera from which views are made."""
+    """Camera from which views are made; the view's option `cameras` merges further ones."""
     width: int = 64
     """Regular fields n of the network; 64 gives the paper's 1.1 M parameters."""
     crop_size: int = 128
@@ -308,16 +308,30 @@ class SymviewConfig(PreTrainedConfig):
         return [self.state_symmetry.index(label) for label in keys.STATE_NAMES]
 
     @property
-    def raw_keys(self) -> list[str]:
-        """Features that a camera must deliver for the policy to run."""
-        if not self.is_computed:
-            return [self.color_key] + ([keys.depth(self.seen_camera)] if self.modality == "rgbd" else [])
-        return [keys.rgb(self.camera)] + ([keys.depth(self.camera)] if self.make_view().needs_depth else [])
+    def merged_cameras(self) -> list[str]:
+        """The cameras that the view merges with `camera`."""
+        return other_cameras([self.make_view()], self.camera) if self.is_computed else []
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the view depends on the earlier frames of an episode."""
+        return self.is_computed and self.make_view().memory
+
+    def raw_keys(self, camera: str) -> list[str]:
+        """Images of a camera that the policy needs to run."""
+        needs_depth = self.make_view().needs_depth if self.is_computed else self.modality == "rgbd"
+        return [keys.rgb(camera)] + ([keys.depth(camera)] if needs_depth else [])
+
+    @property
+    def all_raw_keys(self) -> list[str]:
+        """Images that the cameras must deliver for the policy to run."""
+        return [key for camera in (self.seen_camera, *self.merged_cameras) for key in self.raw_keys(camera)]
 
     def substitutes(self, names: Collection[str]) -> list[str]:
         """Return the cameras of a dataset that can take the place of the policy's; none if this one is there."""
         seen = [self.color_key] + ([self.height_key] if self.modality == "rgbd" and self.height_key else [])
-        return keys.substitutes(names, self.seen_camera, seen, self.raw_keys)
+        found = keys.substitutes(names, self.seen_camera, seen, self.raw_keys(self.seen_camera))
+        return [camera for camera in found if camera not in self.merged_cameras]
 
     def own_names[Value](self, features: Mapping[str, Value]) -> dict[str, Value]:
         """Return features, those of the one camera that can take the place of the policy's under its names."""

@@ -62,6 +62,18 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
         for name, view in views.items():
             if view.needs_depth and not self.depth:
                 raise FlagError(f"the view {name!r} needs depth: keep --env.depth=true or use 'persp'")
+            if view.memory:
+                raise FlagError(
+                    f"the view {name!r} with memory=true needs to know when an episode starts, which LeRobot tells the "
+                    "policy alone: leave it to a symview policy, or use memory=false"
+                )
+            names = [camera.name for camera in self.all_cameras]
+            unknown = [camera for camera in view.cameras if camera not in names]
+            if unknown:
+                raise FlagError(
+                    f"the view {name!r} merges {', '.join(unknown)}, but --env.camera and --env.more_cameras are "
+                    f"{', '.join(names)}"
+                )
             for output, kind in view.outputs.items():
                 shapes[keys.view(self.camera.name, output)] = (view.size, view.size, 3 if kind == "rgb" else 1)
         self.features = {

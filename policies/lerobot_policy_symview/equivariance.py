@@ -126,28 +126,38 @@ def transform_observation(
                 transformed[key] = _transform_pixels(observation[key], group, element)
     is_raw = config.is_computed and config.color_key not in observation
     if camera == "moves" or (camera is None and (config.sees_points or is_raw)):
-        key = keys.world_from_cam(config.camera)
-        pose = observation[key].double().view(-1, 4, 4).clone()
-        center = pose.new_tensor([*parse_workspace(config.workspace).center, 0.0])
-        rotation = torch.eye(3, dtype=pose.dtype, device=pose.device)
-        rotation[:2, :2] = torch.from_numpy(group.rotation()[element])
-        pose[:, :3, :3] = rotation @ pose[:, :3, :3]  # left-handed after a reflection, as the scene is
-        pose[:, :3, 3] = (pose[:, :3, 3] - center) @ rotation.T + center
-        if is_raw and group.reflects(element):
-            transformed |= _reflected_image(observation, config)
-            pose[:, :3, 0] *= -1  # right-handed again, as views require: the image is reflected instead
-        transformed[key] = pose.flatten(1).to(observation[key].dtype)
+        for name in (config.camera, *config.merged_cameras):
+            transformed |= _moved_camera(observation, config, name, group, element, is_raw=is_raw)
     return transformed
 
 
-def _reflected_image(observation: ObservationBatch, config: SymviewConfig) -> ObservationBatch:
+def _moved_camera(
+    observation: ObservationBatch, config: SymviewConfig, camera: str, group: PlanarGroup, element: int, *, is_raw: bool
+) -> ObservationBatch:
+    """Return the calibration of a camera that moves with the scene and, if its view is `is_raw`, its images."""
+    moved: ObservationBatch = {}
+    key = keys.world_from_cam(camera)
+    pose = observation[key].double().view(-1, 4, 4).clone()
+    center = pose.new_tensor([*parse_workspace(config.workspace).center, 0.0])
+    rotation = torch.eye(3, dtype=pose.dtype, device=pose.device)
+    rotation[:2, :2] = torch.from_numpy(group.rotation()[element])
+    pose[:, :3, :3] = rotation @ pose[:, :3, :3]  # left-handed after a reflection, as the scene is
+    pose[:, :3, 3] = (pose[:, :3, 3] - center) @ rotation.T + center
+    if is_raw and group.reflects(element):
+        moved |= _reflected_image(observation, config, camera)
+        pose[:, :3, 0] *= -1  # right-handed again, as views require: the image is reflected instead
+    moved[key] = pose.flatten(1).to(observation[key].dtype)
+    return moved
+
+
+def _reflected_image(observation: ObservationBatch, config: SymviewConfig, camera: str) -> ObservationBatch:
     """Return a camera's images with reversed columns, and the intrinsics and lens that belong to them."""
-    reflected = {key: observation[key].flip(-1) for key in config.raw_keys}
-    key = keys.intrinsics(config.camera)
+    reflected = {key: observation[key].flip(-1) for key in config.raw_keys(camera)}
+    key = keys.intrinsics(camera)
     k = observation[key].clone()
-    k[:, 2] = reflected[config.raw_keys[0]].shape[-1] - 1 - k[:, 2]
+    k[:, 2] = reflected[keys.rgb(camera)].shape[-1] - 1 - k[:, 2]
     reflected[key] = k
-    key = keys.distortion(config.camera)
+    key = keys.distortion(camera)
     if key in observation:
         lens = observation[key].clone()
         lens[:, 4] *= torch.where(lens[:, 0] == NUMBERS[EQUIDISTANT], 1, -1)  # p2, which an equidistant lens lacks

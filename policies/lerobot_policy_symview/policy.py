@@ -29,6 +29,7 @@ from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.processor_allowlist import check_processor_files
 from lerobot_policy_symview.processor_pipelines import changed_options
+from lerobot_policy_symview.processor_views import start_episodes
 from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_transform
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
@@ -157,7 +158,9 @@ class SymviewPolicy(PreTrainedPolicy):
                     average.lerp_(current, 1 - self.config.weight_averaging)
 
     def reset(self) -> None:
-        """Do nothing: the policy has no memory."""
+        """Start an episode. The policy has no memory, its view may have one."""
+        if self.config.remembers:
+            start_episodes()
 
     @property
     def parameter_count(self) -> int:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-import math
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -15,12 +16,11 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
-from lerobot_symview.datasets.features import check_depth_size, declared_unit
+from lerobot_symview.datasets.features import declared_unit
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
-from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import (
     ABOVE_MINIMUM,
     METRES,
@@ -33,20 +33,25 @@ from lerobot_symview.geometry.units import (
     units_per_metre,
 )
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
-from lerobot_symview.views import Frame, View, ViewSpec, make_views
+from lerobot_symview.views import Frame, View, ViewSpec, make_views, other_cameras
 
 if TYPE_CHECKING:
     from lerobot_symview.views.torch_backend import FrameBatch
 
 logger = logging.getLogger(__name__)
 
+Renderer = Callable[[Frame], dict[str, NDArray[Any]]]
+_REMEMBERING: WeakValueDictionary[int, ViewsProcessorStep] = WeakValueDictionary()
 IN_METRES = "observation.depth_in_metres"  # marks observations whose depth a step has brought to metres
 
 
 @dataclass
 @ProcessorStepRegistry.register(name="symview_views")
 class ViewsProcessorStep(ObservationProcessorStep):
-    """Brings depth to float metres and adds top-down views of one camera; views that are present are kept unchanged.
+    """Brings depth to float metres and adds top-down views of a camera; views that are present are kept unchanged.
+
+    A view merges further cameras by its option `cameras`; it is made without those whose image an observation lacks. A
+    view with memory takes successive observations for the successive frames of an episode, until `reset`.
 
     Colour is float in [0, 1] or uint8. Calibration is flat, (9,) and (16,), or square, (3, 3) and (4, 4), for all
     frames or for each, and may have a lens, (9,). An observation without it, such as a real robot's, uses
@@ -61,8 +66,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
             state is unknown: then nothing is clipped and no gripper image is drawn.
         depth_units: feature -> `m`, `mm` or metres per unit, the unit in which depth and height images arrive. It is
             not stored in checkpoints: LeRobot's loader delivers millimetres where an environment delivers metres. Units
-            that are not given are the calibration's; else, for `camera`, the one that shows the table at z = 0; else
-            they are inferred from the values. What is inferred is logged.
+            that are not given are the calibration's; else, for the cameras of views, the one that shows the table at
+            z = 0; else they are inferred from the values. What is inferred is logged.
 
     Raises (from `observation`):
         CalibrationError: if the first observation contradicts the calibration: the camera is below the table, too far
@@ -84,18 +89,25 @@ class ViewsProcessorStep(ObservationProcessorStep):
         views = make_views(specs) if specs else {}
         self._views = views if self.gripper else {name: view.without_gripper() for name, view in views.items()}
         calibration = parse_calibration(self.calibration) if self.calibration else None
-        self._fixed_camera = calibration.camera(self.camera) if calibration else None
+        fixed = {self.camera: calibration.camera(self.camera), **calibration.cameras} if calibration else {}
+        names = [self.camera, *other_cameras(views.values(), self.camera)]
+        self._observed = {name: ObservedCamera(name, fixed.get(name)) for name in names}
         default = calibration.workspace if calibration and not self.workspace else None
         self._workspace = default or parse_workspace(self.workspace)
-        if self._fixed_camera is not None:
-            check_camera(self.camera, self._fixed_camera, self._workspace, minimum=LEAST_VISIBLE)
-        calibrated = calibration.depth_units.get(self.camera) if calibration else None
-        self._units = {} if calibrated is None else {keys.depth(self.camera): calibrated}
+        for name, observed in self._observed.items():
+            if observed.fixed is not None:
+                check_camera(name, observed.fixed, self._workspace, minimum=LEAST_VISIBLE)
+        calibrated = calibration.depth_units if calibration else {}
+        self._units = {keys.depth(name): unit for name, unit in calibrated.items() if name in self._observed}
         self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
         self._table_units: dict[tuple[str, torch.dtype], float] = {}
         self._read_units: dict[str, float] = {}
         self._logged: set[tuple[str, float]] = set()
         self._substitutes: set[str] = set()
+        self._absent: set[str] = set()
+        self._episodes: dict[str, list[Renderer]] = {}
+        if any(view.memory for view in self._views.values()):
+            _REMEMBERING[id(self)] = self
         self._checked = False
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
@@ -108,17 +120,19 @@ class ViewsProcessorStep(ObservationProcessorStep):
         }
         if not missing:
             return observation
-        needs_depth = any(view.needs_depth for view in missing.values())
-        uses_gripper = any(view.uses_gripper for view in missing.values())
-        batch = self._batch(observation, list(missing), needs_depth, uses_gripper)
+        batches = self._batches(observation, missing)
         if not self._checked:
-            self._check(batch)
+            self._check(batches)
             self._checked = True
-        for view in missing.values():
-            for output, images in _render(view, batch).items():
+        for name, view in missing.items():
+            for output, images in self._rendered(name, view, self._merged(view, batches)).items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
                 observation.setdefault(keys.view(self.camera, output), made)
         return observation
+
+    def reset(self) -> None:
+        """Start an episode: views with memory forget the frames of the last one."""
+        self._episodes.clear()
 
     def get_config(self) -> dict[str, Any]:
         """Return the constructor's arguments that a checkpoint stores as JSON."""
@@ -136,9 +150,11 @@ class ViewsProcessorStep(ObservationProcessorStep):
         source = [keys.rgb(self.camera)]
         if any(view.needs_depth for view in self._views.values()):
             source.append(keys.depth(self.camera))
-        if self._fixed_camera is None:
-            source += self._matrix_shapes
+        own = self._observed[self.camera]
+        if own.fixed is None:
+            source += own.matrices
         others = keys.substitutes(observation, self.camera, made, source) if made else []
+        others = [name for name in others if name not in self._observed]
         if len(others) != 1:
             return observation
         if others[0] not in self._substitutes:
@@ -167,7 +183,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
         unit = self._units.get(key) or self._table_units.get((key, values.dtype))
         if unit is not None:
             return unit
-        if key == keys.depth(self.camera) and (unit := self._unit_by_table(values, observation)) is not None:
+        camera = self._observed.get(key.removeprefix(keys.IMAGES).removesuffix("_depth"))
+        if camera is not None and (unit := self._unit_by_table(camera, values, observation)) is not None:
             self._table_units[key, values.dtype] = unit
             logger.info("%s declares no unit: the table at z = 0 shows %s", key, unit_name(unit))
             return unit
@@ -177,104 +194,115 @@ class ViewsProcessorStep(ObservationProcessorStep):
             logger.info("%s declares no unit: its values are taken to be %s", key, unit_name(unit))
         return unit
 
-    def _unit_by_table(self, depth: Tensor, observation: RobotObservation) -> float | None:
+    def _unit_by_table(self, observed: ObservedCamera, depth: Tensor, observation: RobotObservation) -> float | None:
         from lerobot_symview.calibration.table_plane import likely_depth_unit
 
-        color = observation.get(keys.rgb(self.camera))
-        if self._missing_matrices(observation) or not depth.numel() or color is None:
+        color = observation.get(keys.rgb(observed.name))
+        if observed.missing_matrices(observation) or not depth.numel() or color is None:
             return None
-        camera = self._cameras(observation, len(depth), *color.shape[-2:])[0]
+        camera = observed.cameras(observation)[0]
         if camera.depth_sensor is None and depth.shape[-2:] != color.shape[-2:]:
-            return None  # `_batch` rejects it
+            return None  # `aligned_depth` rejects it
         height, width = depth.shape[-2:]
         image = depth[0].reshape(height, width).cpu().numpy()
         return likely_depth_unit(image, camera.depth_camera(height, width), self._workspace)
 
-    def _check(self, batch: FrameBatch) -> None:
-        """Raise a CalibrationError if the first frame contradicts the calibration."""
+    def _check(self, batches: dict[str, FrameBatch]) -> None:
+        """Raise a CalibrationError if the first frame contradicts a camera's calibration; report how cameras agree."""
+        from lerobot_symview.calibration.agreement import report_agreement
         from lerobot_symview.calibration.table_plane import check_table, has_depth
 
-        camera = batch.cameras[0]
-        check_camera(self.camera, camera, self._workspace, minimum=LEAST_VISIBLE)
-        if batch.depth is None:
-            return
-        key, depth = keys.depth(self.camera), batch.depth[0].cpu().numpy()
-        if not has_depth(depth, camera, self._workspace):
-            raise CalibrationError(
-                f"{key} has no valid pixel in the workspace: check the camera, its pose and its lens"
-            )
-        try:
-            check_table(depth, camera, self._workspace, self._read_units.get(key, METRES))
-        except CalibrationError as error:
-            raise CalibrationError(f"{key}: {error}") from None
+        depths: dict[str, NDArray[np.floating]] = {}
+        for name, batch in batches.items():
+            camera = batch.cameras[0]
+            check_camera(name, camera, self._workspace, minimum=LEAST_VISIBLE)
+            if batch.depth is None:
+                continue
+            key, depths[name] = keys.depth(name), batch.depth[0].cpu().numpy()
+            if not has_depth(depths[name], camera, self._workspace):
+                problem = f"{key} has no valid pixel in the workspace: check the camera, its pose and its lens"
+                if len(batches) == 1:
+                    raise CalibrationError(problem)
+                logger.warning("%s", problem)
+                continue
+            try:
+                check_table(depths[name], camera, self._workspace, self._read_units.get(key, METRES))
+            except CalibrationError as error:
+                raise CalibrationError(f"{key}: {error}") from None
+        if len(depths) > 1:
+            gripper = batches[self.camera].gripper if self.camera in batches else None
+            ceiling = None if gripper is None else float(gripper[0, 2])
+            cameras = {name: batch.cameras[0] for name, batch in batches.items()}
+            report_agreement(depths, cameras, self._workspace, ceiling)
 
-    def _batch(
-        self, observation: RobotObservation, views: list[str], needs_depth: bool, uses_gripper: bool
-    ) -> FrameBatch:
+    def _batches(self, observation: RobotObservation, views: dict[str, View]) -> dict[str, FrameBatch]:
+        """Return the images of the cameras that views need and the observation has, by name."""
         from lerobot_symview.views.torch_backend import FrameBatch  # numba: too slow for a plugin's import
 
-        color, depth = keys.rgb(self.camera), keys.depth(self.camera)
-        uses_gripper = uses_gripper and bool(self.gripper)
-        needed = [color] + ([depth] if needs_depth else []) + ([keys.STATE] if uses_gripper else [])
-        missing = [key for key in needed if key not in observation] + self._missing_matrices(observation)
-        if missing:
-            raise KeyError(
-                f"the views {views} need {missing}, the observation has {sorted(observation)}: name its camera with "
-                "--policy.camera, or rename its image with --rename_map"
-            )
-        rgb = observation[color].detach()
-        if rgb.dtype != torch.uint8:
-            rgb = (rgb * 255).round().to(torch.uint8)
-        height, width = rgb.shape[2:]
-        cameras = self._cameras(observation, len(rgb), height, width)
-        return FrameBatch(
-            rgb,
-            self._aligned(observation[depth][:, 0], cameras) if needs_depth else None,
-            cameras,
-            self._workspace,
-            observation[keys.STATE].detach()[:, self.gripper] if uses_gripper else None,
-        )
+        gripper = None
+        needed = []
+        if self.gripper and any(view.uses_gripper for view in views.values()):
+            needed.append(keys.STATE)
+            gripper = observation[keys.STATE].detach()[:, self.gripper] if keys.STATE in observation else None
+        batches: dict[str, FrameBatch] = {}
+        for name, camera in self._observed.items():
+            merging = [view for view in views.values() if name == self.camera or name in view.cameras]
+            depth = any(view.needs_depth for view in merging)
+            if not merging or self._is_absent(name, observation, list(views.values())):
+                continue
+            missing = [key for key in needed + camera.needed(observation, depth=depth) if key not in observation]
+            if missing:
+                raise KeyError(
+                    f"the views {list(views)} need {missing}, the observation has {sorted(observation)}: name its "
+                    "camera with --policy.camera, or rename its image with --rename_map"
+                )
+            cameras = camera.cameras(observation)
+            aligned = camera.aligned_depth(observation, cameras) if depth else None
+            batches[name] = FrameBatch(camera.colors(observation), aligned, cameras, self._workspace, gripper)
+        return batches
 
-    def _aligned(self, depth: Tensor, cameras: list[Camera]) -> Tensor:
-        """Return depth (B, H, W) in the pixels of the colour images; `depth` is that of the sensors, metres."""
-        if all(camera.depth_sensor is None for camera in cameras):
-            check_depth_size(self.camera, depth.shape[1:], (cameras[0].height, cameras[0].width))
-            return depth
-        images = [aligned_depth(image, camera) for image, camera in zip(depth.cpu().numpy(), cameras, strict=True)]
-        return torch.from_numpy(np.stack(images)).to(depth.device)
+    def _is_absent(self, name: str, observation: RobotObservation, views: list[View]) -> bool:
+        """Whether a camera delivers nothing now, but another one with which all views merge it does."""
+        if keys.rgb(name) in observation:
+            return False
+        merged = [{self.camera, *view.cameras} for view in views]
+        present = [other for other in self._observed if keys.rgb(other) in observation]
+        is_absent = all(any(other in cameras for other in present) for cameras in merged)
+        if is_absent and name not in self._absent:
+            self._absent.add(name)
+            logger.warning("the observation has no %s: views are made without it", keys.rgb(name))
+        return is_absent
 
-    def _missing_matrices(self, observation: RobotObservation) -> list[str]:
-        """Return the calibration's keys that the observation lacks, where the step has no calibration of its own."""
-        return [] if self._fixed_camera is not None else [key for key in self._matrix_shapes if key not in observation]
+    def _merged(self, view: View, batches: dict[str, FrameBatch]) -> FrameBatch:
+        """Return the batch of a view: that of its first camera, with those of the cameras that it merges."""
+        first, *others = [name for name in (self.camera, *other_cameras([view], self.camera)) if name in batches]
+        return replace(batches[first], others={name: batches[name] for name in others})
 
-    @property
-    def _matrix_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Keys of an observation's calibration -> shape of the matrix."""
-        return {keys.intrinsics(self.camera): (3, 3), keys.world_from_cam(self.camera): (4, 4)}
+    def _rendered(self, name: str, view: View, batch: FrameBatch) -> dict[str, Tensor]:
+        """Return each output for all frames, on their device: together by CUDA, by the compiled kernels elsewhere."""
+        from lerobot_symview.views.torch_backend import can_batch, render_batch
 
-    def _cameras(self, observation: RobotObservation, count: int, height: int, width: int) -> list[Camera]:
-        """Return the camera of each of `count` frames: the observation's, else the step's own."""
-        if all(key in observation for key in self._matrix_shapes):
-            shapes = self._matrix_shapes | {
-                keys.distortion(self.camera): (STORED,),
-                keys.depth_intrinsics(self.camera): (3, 3),
-                keys.color_from_depth(self.camera): (4, 4),
-            }
-            stored = keys.calibration(self.camera, observation)
-            names = [keys.parameter(key) for key in stored]
-            columns = (_numbers(key, observation[key], shapes[key], count) for key in stored)
-            return [
-                stored_camera(height=height, width=width, **dict(zip(names, numbers, strict=True)))
-                for numbers in zip(*columns, strict=True)
-            ]
-        camera = self._fixed_camera
-        assert camera is not None
-        if (height, width) != (camera.height, camera.width):
-            raise CalibrationError(
-                f"camera {self.camera!r} is calibrated for {camera.height} x {camera.width} pixels, "
-                f"the observation has {height} x {width}"
-            )
-        return [camera] * count
+        device = batch.rgb.device
+        if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which bit-identical images need
+            return render_batch(view, batch)
+        frames = _frames(batch)
+        if len(self._episodes.get(name, ())) != len(frames):
+            self._episodes[name] = [view.start_episode() for _ in frames]
+        images = [render(frame) for render, frame in zip(self._episodes[name], frames, strict=True)]
+        stacked = {output: torch.from_numpy(np.stack([image[output] for image in images])) for output in images[0]}
+        channels_first = {
+            output: image.permute(0, 3, 1, 2) if image.ndim == 4 else image for output, image in stacked.items()
+        }
+        return {output: image.to(device) for output, image in channels_first.items()}
+
+
+def start_episodes() -> None:
+    """Reset every live step whose views have memory.
+
+    LeRobot's evaluation resets the policy at the start of its episodes, and not the processors.
+    """
+    for step in list(_REMEMBERING.values()):
+        step.reset()
 
 
 def delivered_units(meta: Any) -> dict[str, float]:
@@ -311,38 +339,18 @@ def _without_minimum(depth: Tensor) -> Tensor:
     return torch.where(is_lost, torch.zeros_like(depth), depth)
 
 
-def _numbers(key: str, numbers: Tensor, shape: tuple[int, ...], count: int) -> NDArray[np.floating]:
-    """Return (count, N): numbers for each frame, or for all, which LeRobot leaves without a batch axis."""
-    flat = (math.prod(shape),)
-    shapes = list(dict.fromkeys([flat, shape, (count, *flat), (count, *shape)]))
-    if tuple(numbers.shape) not in shapes:
-        raise CalibrationError(f"{key} has shape {tuple(numbers.shape)}, expected one of {shapes}")
-    return np.broadcast_to(numbers.detach().cpu().numpy().reshape(-1, *flat), (count, *flat))
-
-
-def _render(view: View, batch: FrameBatch) -> dict[str, Tensor]:
-    """Return each output for all frames, on their device: together by CUDA, by the compiled kernels elsewhere."""
-    from lerobot_symview.views.torch_backend import can_batch, render_batch
-
-    device = batch.rgb.device
-    if device.type == "cuda" and can_batch(view):  # Apple's GPUs have no float64, which bit-identical images need
-        return render_batch(view, batch)
+def _frames(batch: FrameBatch) -> list[Frame]:
     rgb = batch.rgb.permute(0, 2, 3, 1).contiguous().cpu().numpy()
     depth, gripper = (None if one is None else one.cpu().numpy() for one in (batch.depth, batch.gripper))
-    images = [
-        view.render(
-            Frame(
-                rgb[i],
-                None if depth is None else depth[i],
-                camera,
-                batch.workspace,
-                None if gripper is None else gripper[i],
-            )
+    others = {name: _frames(other) for name, other in batch.others.items()}
+    return [
+        Frame(
+            rgb[i],
+            None if depth is None else depth[i],
+            camera,
+            batch.workspace,
+            None if gripper is None else gripper[i],
+            {name: frames[i] for name, frames in others.items()},
         )
         for i, camera in enumerate(batch.cameras)
     ]
-    stacked = {output: torch.from_numpy(np.stack([image[output] for image in images])) for output in images[0]}
-    channels_first = {
-        output: image.permute(0, 3, 1, 2) if image.ndim == 4 else image for output, image in stacked.items()
-    }
-    return {output: image.to(device) for output, image in channels_first.items()}

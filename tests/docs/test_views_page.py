@@ -15,6 +15,7 @@ def test_every_view_option_is_listed_with_its_default(view):
     page = (ROOT / "docs" / "views.md").read_text()
     for option in fields(view):
         default = f"{option.default:g}" if isinstance(option.default, float) else str(option.default).lower()
+        default = "[]" if option.default == () else default
         assert re.search(rf"^\| `{option.name}` \| `?{re.escape(default)}`? \|", page, re.MULTILINE), option.name
 
 

@@ -20,6 +20,7 @@ from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.views import ViewSpec
 from symview_sim.settings import EnvSettings
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
@@ -190,8 +191,10 @@ def test_every_orientation_in_the_state_rotates_with_the_scene(state, gripper_in
 
 @pytest.fixture(scope="module")
 def raw():
-    """A batch of one simulated observation, without views."""
-    env = EnvSettings("block_picking").make()
+    """A batch of one simulated observation of two cameras, without views."""
+    env = EnvSettings(
+        "block_picking", more_cameras=(CameraSpec("left", height=96, width=128, azimuth_deg=80.0),)
+    ).make()
     observation, _ = env.reset(seed=3)
     env.close()
     batched = {
@@ -206,8 +209,10 @@ def raw():
     ("method", "options", "rotated_tolerance", "reflected_tolerance"),
     [
         ("persp_equi", {"size": 76}, 1e-4, 1e-4),
+        ("persp_equi", {"size": 76, "cameras": ["side", "left"]}, 1e-4, 1e-4),
         ("voxel_equi", {}, 1e-4, 1e-4),
         ("reproj_equi", {"size": 76, "infill": "none"}, 1e-4, 0.1),
+        ("reproj_equi", {"size": 76, "infill": "none", "cameras": ["side", "left"]}, 1e-4, 0.1),
         ("reproj_equi", {"size": 76, "infill": "nearest"}, 0.2, 0.2),
     ],
 )

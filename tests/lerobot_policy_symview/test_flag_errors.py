@@ -107,9 +107,13 @@ WRONG = {
         "reproj.source_scale": (9, "env.*reproj.*source_scale must be an integer from 1 to 8, got 9"),
         "reproj.height": ("perhaps", "reproj.height.*'perhaps'"),
         "reproj.mask": ("perhaps", "reproj.mask.*'perhaps'"),
+        "reproj.memory": ("perhaps", "reproj.memory.*'perhaps'"),
+        "reproj.age": ("perhaps", "reproj.age.*'perhaps'"),
+        "reproj.cameras": (["left", "left"], "env.*reproj.*cameras must differ, got left, left"),
         "persp.size": (4, "env.*persp.*a view's size must be an integer from 8 to 4096 pixels, got 4"),
         "persp.plane_height": (NAN, "env.*persp.*plane_height must be gripper or a height in metres, got nan"),
         "persp.gripper": ("perhaps", "persp.gripper.*'perhaps'"),
+        "persp.cameras": (["left", "left"], "env.*persp.*cameras must differ, got left, left"),
     },
 }
 """Configuration -> field -> a wrong value, and what the terminal shows."""

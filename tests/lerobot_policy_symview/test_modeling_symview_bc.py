@@ -334,7 +334,7 @@ def test_given_options_take_precedence_over_the_methods():
 
 def test_side_view_uses_the_named_camera():
     config = SymviewBcConfig(device="cpu", method="sideview_equi", camera="left")
-    assert config.raw_keys == [keys.rgb("left"), keys.depth("left")]
+    assert config.all_raw_keys == [keys.rgb("left"), keys.depth("left")]
 
 
 def test_configuration_choices_match_the_networks():

@@ -113,7 +113,7 @@ def test_fine_tuning_on_images_of_a_camera(recorded, raw, tmp_path, monkeypatch)
     pretrained = train(monkeypatch, recorded, tmp_path / "policy", method)
     for flag, camera in ((CAMERA, "front"), (RENAME, "side")):
         tuned = fine_tune(monkeypatch, pretrained, raw, tmp_path / camera, flag)
-        assert PreTrainedConfig.from_pretrained(tuned).raw_keys == [keys.rgb(camera), keys.depth(camera)]
+        assert PreTrainedConfig.from_pretrained(tuned).all_raw_keys == [keys.rgb(camera), keys.depth(camera)]
 
 
 @pytest.mark.parametrize("flags", [[CAMERA], [RENAME], [CAMERA, RENAME]], ids=["camera", "rename", "both"])

@@ -196,7 +196,7 @@ def _ratios(frame: Frame, repeats: int) -> dict[str, float]:
 
 def real_camera_times(repeats: int) -> dict[str, float]:
     """Return the milliseconds of reprojections of the table from images of real cameras, and ratios to `vga_ms`."""
-    view, workspace = make_view("reproj", clip="none"), Workspace()
+    view, workspace = make_view("reproj", clip="none", cameras=("left",)), Workspace()
     vga, hd = (CameraSpec(height=rows, width=columns).place(workspace) for rows, columns in ((480, 640), (720, 1280)))
     frames = {
         "vga": _table_frame(vga, workspace),
@@ -214,7 +214,7 @@ def real_camera_times(repeats: int) -> dict[str, float]:
     calls: dict[str, Callable[[], object]] = {name: partial(view.render, frame) for name, frame in frames.items()}
     calls["vga_unaligned"] = render_unaligned
     other = _table_frame(CameraSpec(height=480, width=640, azimuth_deg=90.0).place(workspace), workspace)
-    calls["fused"] = partial(view.render, replace(frames["vga"], others=(other,)))
+    calls["fused"] = partial(view.render, replace(frames["vga"], others={"left": other}))
     for call in calls.values():
         call()
     rounds = [{name: 1000 * seconds(call) for name, call in calls.items()} for _ in range(repeats)]

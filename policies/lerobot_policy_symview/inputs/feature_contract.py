@@ -37,16 +37,21 @@ def read_features(config: SymviewConfig, features: Features) -> None:
     _check_vectors(config, features)
     features = _own_names(config, features)
     _read_view(config, features)
-    has_raw = all(key in features for key in config.raw_keys)
+    has_raw = all(key in features for key in config.all_raw_keys)
     if not has_raw and config.color_key not in features:
         raise ValueError(
-            f"--policy.view={config.view.name} needs {config.raw_keys} or {config.color_key!r}; "
+            f"--policy.view={config.view.name} needs {config.all_raw_keys} or {config.color_key!r}; "
             f"the dataset has {sorted(key for key in features if 'images' in key)}: "
             "for the view of another camera, give its name by --policy.camera"
         )
+    if config.remembers and config.color_key not in features:
+        raise ValueError(
+            f"--policy.view={config.view.name} with memory=true is made from the frames of an episode in order, which "
+            f"training does not read: add it to the dataset, by symview-add-views --{config.view.name}.memory=true"
+        )
     _check_size(config, features)
     _check_alignment(config, features)
-    visuals = list(config.raw_keys)
+    visuals = config.all_raw_keys
     if not has_raw:
         visuals += [key for key, feature in features.items() if feature["dtype"] in ("image", "video")]
     config.input_features = {
@@ -102,7 +107,7 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
         except (KeyError, TypeError, ValueError, OptionError) as error:
             raise ValueError(f"the dataset does not say how {config.color_key} was made: {error}") from None
     else:
-        raw = features.get(config.raw_keys[0], {}).get("info") or {}
+        raw = features.get(keys.rgb(config.seen_camera), {}).get("info") or {}
         config.workspace = dict(raw.get("symview", {}).get("workspace", config.workspace))
         if config.is_computed and not set(keys.STATE_NAMES) <= set(config.state_symmetry):
             changed = _changed_options(config.make_view(), config.make_view().without_gripper())
@@ -110,10 +115,10 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
 
 
 def read_calibration(config: SymviewConfig) -> None:
-    """Set a configuration's calibration to that of a camera that never moved in the training dataset.
+    """Set a configuration's calibration to that of the cameras that never moved in the training dataset.
 
-    It is for observations without calibration, such as a real robot's. If the camera moved, or the dataset lacks its
-    calibration, the configuration is unchanged, unless its calibration is that of another camera.
+    It is for observations without calibration, such as a real robot's. If the policy's camera moved, or the dataset
+    lacks its calibration, the configuration is unchanged, unless its calibration is that of another camera.
 
     Raises:
         CalibrationError: if the calibration in the dataset is invalid.
@@ -121,11 +126,15 @@ def read_calibration(config: SymviewConfig) -> None:
     meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
     if meta is not None and (config.uses_calibration or config.check_camera):
         name = next(iter(config.substitutes(meta.features)), config.camera)
-        camera = _fixed_camera(meta, name)
-        if camera is not None:
-            recorded = _calibration_file(meta)
-            units = {config.camera: recorded.depth_units[name]} if recorded and name in recorded.depth_units else {}
-            config.calibration = plain_calibration(Calibration({config.camera: camera}, depth_units=units))
+        names = {config.camera: name} | {other: other for other in config.merged_cameras}  # own -> the dataset's
+        found = {own: _fixed_camera(meta, recorded) for own, recorded in names.items()}
+        cameras = {own: camera for own, camera in found.items() if camera is not None}
+        if config.camera in cameras:
+            file = _calibration_file(meta)
+            units = (
+                {own: file.depth_units[names[own]] for own in cameras if names[own] in file.depth_units} if file else {}
+            )
+            config.calibration = plain_calibration(Calibration(cameras, depth_units=units))
         elif name != config.camera:
             config.calibration = {}
 
@@ -180,7 +189,7 @@ def _check_size(config: SymviewConfig, features: Features) -> None:
 
 def _check_alignment(config: SymviewConfig, features: Features) -> None:
     key = keys.depth(config.seen_camera)
-    if key not in config.raw_keys or config.is_computed or key not in features:
+    if config.is_computed or key not in config.all_raw_keys or key not in features:
         return  # views register depth
     sensor = keys.depth_intrinsics(config.seen_camera)
     size, color_size = (image_size(features, name) for name in (key, config.color_key))

@@ -123,7 +123,9 @@ def test_views_of_frames_equal_the_function():
     frame, other = [
         Frame(rgb, depth, camera, WORKSPACE) for (rgb, depth), camera in zip(images, (FRONT, LEFT), strict=True)
     ]
-    made = make_view("reproj", infill="occlusion").render(replace(frame, others=(other,)))
+    made = make_view("reproj", infill="occlusion", cameras=["front", "left"]).render(
+        replace(frame, others={"left": other})
+    )
     np.testing.assert_array_equal(made["reproj"], views_of([FRONT, LEFT], infill="occlusion").rgb)
 
 
@@ -166,7 +168,7 @@ def test_what_does_not_fit_together_is_refused():
         reproject([rgb, rgb], [depth], [FRONT, FRONT], WORKSPACE)
     other = Frame(rgb, depth, FRONT, Workspace(size=0.5))
     with pytest.raises(ValueError, match="one workspace"):
-        Frame(rgb, depth, FRONT, WORKSPACE, others=(other,))
+        Frame(rgb, depth, FRONT, WORKSPACE, others={"left": other})
 
 
 def test_buffers_of_one_camera_are_its_own():

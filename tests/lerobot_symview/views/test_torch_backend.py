@@ -24,27 +24,44 @@ OPTIONS = [
     ("persp", {}),
     ("persp", {"plane_height": "gripper", "gripper": False}),
     ("reproj", {"flying_limit": 0.05}),
+    ("reproj", {"cameras": ["left", "back"]}),
+    ("persp", {"cameras": ["left", "back"]}),
 ]
+OTHERS = {"left": make_camera(azimuth=80, size=40), "back": make_camera(azimuth=190, elevation=30, size=56)}
 
 
 def frames_of(views, seed):
-    """One frame per camera; every second row of depth is rounded, so that many heights are equal."""
+    """One frame per camera, with those of `OTHERS`; half of the rows are rounded, so that many heights are equal.
+
+    In every other frame, the camera `left` delivers nothing.
+    """
     rng = np.random.default_rng(seed)
-    for camera in views:
-        depth = random_depth(int(rng.integers(2**31))).astype(np.float32)
-        depth[::2] = np.round(depth[::2], 1)
+    for index, camera in enumerate(views):
         gripper = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.0, 0.1), rng.uniform(-2, 2), rng.random()])
-        rgb = rng.integers(0, 256, (*SHAPE, 3), dtype=np.uint8)
-        yield Frame(rgb, depth, camera, Workspace(), gripper.astype(np.float32))
+        gripper = gripper.astype(np.float32)
+        others = {name: random_frame(other, gripper, rng) for name, other in OTHERS.items()}
+        if index % 2:
+            left = others["left"]
+            others["left"] = replace(left, rgb=np.zeros_like(left.rgb), depth=np.zeros_like(left.depth))
+        yield replace(random_frame(camera, gripper, rng), others=others)
+
+
+def random_frame(camera, gripper, rng):
+    shape = (camera.height, camera.width)
+    depth = random_depth(int(rng.integers(2**31)), shape).astype(np.float32)
+    depth[::2] = np.round(depth[::2], 1)
+    return Frame(rng.integers(0, 256, (*shape, 3), dtype=np.uint8), depth, camera, Workspace(), gripper)
 
 
 def batch_of(frames, device):
+    others = {name: batch_of([frame.others[name] for frame in frames], device) for name in frames[0].others}
     return FrameBatch(
         torch.from_numpy(np.stack([frame.rgb for frame in frames])).permute(0, 3, 1, 2).contiguous().to(device),
         torch.from_numpy(np.stack([frame.depth for frame in frames])).to(device),
         [frame.camera for frame in frames],
         frames[0].workspace,
         torch.from_numpy(np.stack([frame.gripper for frame in frames])).to(device),
+        others,
     )
 
 
