@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -127,7 +128,7 @@ class FrameSample:
 
 
 def read_samples(
-    source: SourceDataset, reader: FrameReader | None, episode: int, indices: list[int]
+    source: SourceDataset, reader: FrameReader | None, episode: int, indices: Iterable[int]
 ) -> list[FrameSample]:
     """Return the frames `indices` of an episode; without a reader, only their stored images."""
     table = EpisodeTables(source, source.data_file(episode)).read(episode)
@@ -178,12 +179,16 @@ def preview(config: PreviewConfig) -> Path:
     for episode in tqdm(config.episodes, desc="preview", unit="episode"):
         length = source.episodes[episode]["length"]
         indices = np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist()
-        for sample in read_samples(source, reader, episode, indices):
+        renderers = [view.with_mask().start_episode() for view in views.values()]
+        needed = range(indices[-1] + 1) if any(view.memory for view in views.values()) else indices
+        for sample in read_samples(source, reader, episode, needed):
             if sample.frame is None or reader is None:
                 shown = {name: _displayable(image) for name, image in sample.stored.items()}
                 rows.append(SheetRow(sample.title, [], shown))
                 continue
-            made = _render(sample.frame, config.camera, views)
+            made = _render(sample.frame, config.camera, renderers)
+            if sample.index not in indices:
+                continue
             measures = _measure(sample.frame.camera, reader.workspace, made)
             rows.append(_row(config.camera, sample, sample.frame, made, measures))
             measured.append(measures)
@@ -252,11 +257,11 @@ def _stored_views(features: Features) -> list[str]:
     return [key.removeprefix(keys.IMAGES) for key, fact in facts.items() if "view" in fact]
 
 
-def _render(frame: Frame, camera: str, views: dict[str, View]) -> dict[str, NDArray]:
-    """Return every output of the views by name, with the masks of the views that have one."""
+def _render(frame: Frame, camera: str, renderers: list[Callable[[Frame], dict[str, NDArray]]]) -> dict[str, NDArray]:
+    """Return every output of the views by name."""
     images: dict[str, NDArray] = {}
-    for view in views.values():
-        images |= view.with_mask().render(frame)
+    for render in renderers:
+        images |= render(frame)
     return {f"{camera}_{output}": image for output, image in images.items()}
 
 

@@ -63,29 +63,28 @@ def recall(
     seen = buffer.source != EMPTY
     if memory is None:
         return buffer, np.where(seen, 0, FORGOTTEN).astype(np.int32)
-    pixels = len(seen)
-    hidden = (memory.age != FORGOTTEN) & ~seen
+    pixels, cell = len(seen), workspace.size / len(seen)
+    hidden = np.zeros_like(seen)
+    row, column, lowest = 0.0, 0.0, np.inf
     if gripper is not None:
-        cell = workspace.size / pixels
         row, column = (float(gripper[axis]) / cell + pixels / 2 for axis in (0, 1))
-        _forget(hidden, memory.height, row, column, GRIPPER_RADIUS / cell, float(gripper[2]) - GRIPPER_DEPTH)
+        lowest = float(gripper[2]) - GRIPPER_DEPTH
+    _remembered(hidden, buffer.source, memory.height, memory.age, row, column, GRIPPER_RADIUS / cell, lowest)
     for depth, camera in zip(depths, cameras, strict=True):
         _keep_hidden(hidden, memory.height, pinhole_depth(depth, camera), image_from_grid(camera, workspace, pixels))
-    first = sum(camera.height * camera.width for camera in cameras)
-    cells = np.arange(first, first + hidden.size, dtype=np.int32).reshape(hidden.shape)
-    merged = ZBuffer(np.where(hidden, memory.height, buffer.height), np.where(hidden, cells, buffer.source))
-    age = np.where(seen, 0, np.where(hidden, memory.age + 1, FORGOTTEN)).astype(np.int32)
+    merged, age = ZBuffer(buffer.height.copy(), buffer.source.copy()), np.empty_like(memory.age)
+    _merge(hidden, memory.height, memory.age, sum(camera.height * camera.width for camera in cameras), *merged, age)
     return merged, age
 
 
 @njit(cache=True, nogil=True)
-def _forget(hidden, heights, row, column, radius, lowest):  # type: ignore[no-untyped-def]
+def _remembered(hidden, sources, heights, ages, row, column, radius, lowest):  # type: ignore[no-untyped-def]
     side = hidden.shape[0]
-    for i in range(max(0, int(row - radius)), min(side, int(row + radius) + 1)):
-        for j in range(max(0, int(column - radius)), min(side, int(column + radius) + 1)):
-            is_near = (i + 0.5 - row) ** 2 + (j + 0.5 - column) ** 2 <= radius**2
-            if is_near and heights[i, j] >= lowest:
-                hidden[i, j] = False
+    for i in range(side):
+        for j in range(side):
+            if sources[i, j] < 0 and ages[i, j] >= 0:
+                is_near = (i + 0.5 - row) ** 2 + (j + 0.5 - column) ** 2 <= radius**2
+                hidden[i, j] = not (is_near and heights[i, j] >= lowest)
 
 
 @njit(cache=True, nogil=True)
@@ -96,3 +95,14 @@ def _keep_hidden(hidden, heights, depth, matrix):  # type: ignore[no-untyped-def
             if hidden[i, j]:
                 distance, measured = measured_at(depth, matrix, i + 0.5, j + 0.5, heights[i, j])
                 hidden[i, j] = not (measured < np.inf and measured > 0.0 and measured >= distance - SEE_THROUGH)
+
+
+@njit(cache=True, nogil=True)
+def _merge(hidden, heights, ages, first, height, source, age):  # type: ignore[no-untyped-def]
+    side = hidden.shape[0]
+    for i in range(side):
+        for j in range(side):
+            age[i, j] = 0 if source[i, j] >= 0 else -1
+            if hidden[i, j]:
+                height[i, j], source[i, j] = heights[i, j], first + i * side + j
+                age[i, j] = ages[i, j] + 1

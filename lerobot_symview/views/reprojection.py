@@ -224,16 +224,14 @@ class ReprojectedView(View):
             for source in sources:
                 shown = occlusion.without_smear(shown, buffer, source.depth, source.camera, frame.workspace)
         colors, height = zbuffer.gather(shown, buffer, colors_of)
+        remembered = None if age is None else Memory(colors.copy(), height.copy(), age)  # infill changes no known cell
         if self.infill == "local":
             colors, height = infill.fill_local(colors, known), infill.fill_local(height, known)
         images: dict[str, NDArray] = {"reproj": colors, "reproj_height": height}
         if self.mask:
             images["reproj_seen"] = gray_to_rgb(seen.astype(np.uint8) * np.uint8(255))
-        if age is None:
-            return {output: images[output] for output in self.outputs}, None
-        if self.age:
+        if age is not None and self.age:
             images["reproj_age"] = gray_to_rgb(np.where(age < 0, 255, np.minimum(age, 254)).astype(np.uint8))
-        remembered = Memory(*zbuffer.gather(_identity_cells(self.size), buffer, colors_of), age)
         return {output: images[output] for output in self.outputs}, remembered
 
     def _source(self, frame: Frame) -> _Source:

@@ -29,7 +29,7 @@ from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.visibility import table_rays
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views import Frame, ViewSpec, make_view
+from lerobot_symview.views import Frame, View, ViewSpec, make_view
 from symview_eval.benchmarks.clock import Clock, seconds
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
@@ -214,6 +214,7 @@ def real_camera_times(repeats: int) -> dict[str, float]:
     calls: dict[str, Callable[[], object]] = {name: partial(view.render, frame) for name, frame in frames.items()}
     calls["vga_unaligned"] = render_unaligned
     other = _table_frame(CameraSpec(height=480, width=640, azimuth_deg=90.0).place(workspace), workspace)
+    calls |= {"episode": _episode(view, frames["vga"]), "memory": _episode(replace(view, memory=True), frames["vga"])}
     calls["fused"] = partial(view.render, replace(frames["vga"], others={"left": other}))
     for call in calls.values():
         call()
@@ -223,7 +224,22 @@ def real_camera_times(repeats: int) -> dict[str, float]:
         results |= _median_and_quartiles(f"{name}_ms", [times[name] for times in rounds])
     for name in ("vga_lens", "vga_unaligned", "fused"):
         results |= _median_and_quartiles(f"{name}_ratio", [times[name] / times["vga"] for times in rounds])
+    results |= _median_and_quartiles("memory_ratio", [times["memory"] / times["episode"] for times in rounds])
     return results
+
+
+def _episode(view: View, frame: Frame) -> Callable[[], object]:
+    """Return a call that renders 16 frames of an episode; in all but the first, a third of the image is hidden."""
+    assert frame.depth is not None
+    hidden = frame.depth.copy()
+    hidden[:, : frame.camera.width // 3] = 0.3
+    later = replace(frame, depth=hidden)
+
+    def call() -> object:
+        render = view.start_episode()
+        return [render(each) for each in [frame] + [later] * 15]
+
+    return call
 
 
 def _table_frame(camera: Camera, workspace: Workspace) -> Frame:

@@ -22,9 +22,11 @@ from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_policy_symview.rl.train_rl import train_rl
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.runtime.staging import part_of
-from symview_eval.experiments.cloning import run_cloning
+from symview_eval.experiments.cloning import policy_config, run_cloning
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.placements import evaluate_placements
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
@@ -52,6 +54,14 @@ class CellJob:
     def demonstrations(self) -> NewDataset:
         """Location of the cell's demonstrations."""
         name = self.cell.recording
+        return NewDataset(f"symview/{name}", self.folder / "recordings" / name)
+
+    @property
+    def training_data(self) -> NewDataset:
+        """Location of the dataset that the cell trains on: the demonstrations, with a view that has memory."""
+        if not self.cell.row.remembers:
+            return self.demonstrations
+        name = f"{self.cell.recording}_{self.cell.row.name}_{self.cell.scale.name}"
         return NewDataset(f"symview/{name}", self.folder / "recordings" / name)
 
     @property
@@ -98,8 +108,19 @@ def _attempt(job: CellJob, work: Callable[[CellJob], None]) -> Outcome:
 
 def _record(job: CellJob) -> None:
     cell = job.cell
-    env = RecordedEnv(task=cell.task, camera=cell.row.camera)
+    env = RecordedEnv(task=cell.task, camera=cell.row.camera, more_cameras=cell.row.more_cameras)
     generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
+    if cell.row.remembers:
+        source, target = job.demonstrations, job.training_data
+        add_views(
+            AddViewsConfig(
+                HubDataset(source.repo_id, source.root),
+                new_repo_id=target.repo_id,
+                new_root=target.root,
+                views=policy_config(cell, "cpu").views_to_make,
+                resume=True,
+            )
+        )
 
 
 def _run(job: CellJob) -> None:
@@ -107,6 +128,7 @@ def _run(job: CellJob) -> None:
     env = EnvSettings(
         task=cell.task,
         camera=cell.row.camera,
+        more_cameras=cell.row.more_cameras,
         oracle=cell.row.policy["method"].startswith("oracle"),
         max_steps=cell.scale.max_steps,
     )
@@ -132,7 +154,7 @@ def _run(job: CellJob) -> None:
 
 def _train(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
     """Clone the demonstrations and save the policy; return the evaluations during the training and its times."""
-    training = run_cloning(job.cell, open_dataset(job.demonstrations), env, job.device)
+    training = run_cloning(job.cell, open_dataset(job.training_data), env, job.device)
     part = part_of(job.policy)
     for saved in (training.actor.policy, training.actor.preprocessor, training.actor.postprocessor):
         saved.save_pretrained(part)

@@ -33,6 +33,13 @@ class MethodRow:
     """Policy settings: `method`, and overrides of that method's settings."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
+    more_cameras: tuple[CameraSpec, ...] = ()
+    """Further cameras, which the view merges."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its view has memory, and must be added to the demonstrations before the training."""
+        return bool(self.policy.get("view_options", {}).get("memory"))
 
     @property
     def policy_options(self) -> dict[str, Any]:
@@ -79,8 +86,10 @@ class Cell:
     @property
     def recording(self) -> str:
         """Name of its demonstrations, which all methods with the same camera share."""
-        camera = f"{self.row.camera.elevation_deg:g}deg{'_varying' if self.row.camera.varies else ''}"
-        return f"{self.task}_{camera}_{self.demonstrations}_seed{self.seed}"
+        camera, others = self.row.camera, self.row.more_cameras
+        kind = f"{'_varying' if camera.varies else ''}{'' if camera.sees_robot else '_without_arm'}"
+        cameras = "_".join([f"{camera.elevation_deg:g}deg{kind}", *(other.name for other in others)])
+        return f"{self.task}_{cameras}_{self.demonstrations}_seed{self.seed}"
 
     @property
     def placements(self) -> tuple[tuple[str, CameraSpec], ...]:
@@ -119,6 +128,8 @@ class Cell:
             "policy": {**scale.policy(self.algorithm), **self.row.policy},
             "elevation_deg": self.row.camera.elevation_deg,
             **({"spread": asdict(self.row.camera.spread)} if self.row.camera.varies else {}),
+            **({} if self.row.camera.sees_robot else {"sees_robot": False}),
+            **({"more_cameras": [asdict(camera) for camera in self.row.more_cameras]} if self.row.more_cameras else {}),
             "task": self.task,
             "demonstrations": self.demonstrations,
             "seed": self.seed,
@@ -208,6 +219,16 @@ SENSORS = (
     ("flying pixels 50 %", CameraSpec(flying_pixels=0.5)),
     ("late by an action", CameraSpec(delay=1)),
 )
+
+
+SECOND_CAMERA = CameraSpec("left", azimuth_deg=90.0)
+
+
+def _seeing_more(name: str, label: str, *cameras: CameraSpec, arm: bool = True, memory: bool = False) -> MethodRow:
+    merged = {"cameras": [camera.name for camera in cameras]} if cameras else {}
+    options = merged | ({"memory": True} if memory else {})
+    policy = {"method": "reproj_equi", **({"view_options": options} if options else {})}
+    return MethodRow(f"reproj_equi_{name}", f"Reproj. Equi, {label}", policy, CameraSpec(sees_robot=arm), cameras)
 
 
 def _with_varying_camera(row: MethodRow) -> MethodRow:
@@ -308,6 +329,20 @@ EXPERIMENTS = {
             CLONED_TASKS,
             (10,),
             placements=SENSORS,
+        ),
+        Experiment(
+            "hidden",
+            "What the arm hides",
+            (
+                ORACLE,
+                REPROJ,
+                _seeing_more("memory", "memory", memory=True),
+                _seeing_more("two_cameras", "two cameras", SECOND_CAMERA),
+                _seeing_more("two_cameras_memory", "two cameras and memory", SECOND_CAMERA, memory=True),
+                _seeing_more("without_arm", "arm not drawn", arm=False),
+            ),
+            CLONED_TASKS,
+            (10,),
         ),
         Experiment(
             "figure7",

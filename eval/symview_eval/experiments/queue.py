@@ -102,7 +102,7 @@ def _rank(cell: Cell) -> int:
         return 1
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
         return 2
-    if cell.experiment in ("transfer", "robustness") and cell.task in TRANSFER_TASKS:
+    if cell.experiment in ("transfer", "robustness", "hidden") and cell.task in TRANSFER_TASKS:
         return 2
     return 3
 
