@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.features import Features, calibration_vectors
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
 from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
@@ -207,13 +207,7 @@ def _added_vectors(reader: FrameReader) -> dict[str, np.ndarray]:
     """Return the calibration that is added to the result, flattened float32, by feature key."""
     vectors: dict[str, np.ndarray] = {}
     for name, camera in reader.given_cameras().items():
-        numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
-        if camera.lens is not None:
-            numbers[keys.distortion] = camera.lens.stored()
-        if camera.depth_sensor is not None:
-            numbers[keys.depth_intrinsics] = camera.depth_sensor.intrinsics
-            numbers[keys.color_from_depth] = camera.depth_sensor.color_from_depth
-        vectors |= {key(name): values.astype(np.float32).ravel() for key, values in numbers.items()}
+        vectors |= calibration_vectors(name, camera)
     return vectors
 
 

@@ -10,6 +10,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.lens import STORED
@@ -17,6 +20,7 @@ from lerobot_symview.geometry.units import UNIT_NAMES
 from lerobot_symview.geometry.workspace import Workspace
 
 if TYPE_CHECKING:
+    from lerobot_symview.geometry.camera import Camera
     from lerobot_symview.views import View
 
 Features = dict[str, dict[str, Any]]
@@ -60,6 +64,17 @@ def calibration_features(name: str, *, lens: bool = False, depth_sensor: bool = 
         names = ["model", *(f"d{index}" for index in range(1, STORED))]
         features[keys.distortion(name)] = {"dtype": "float32", "shape": (STORED,), "names": names}
     return features
+
+
+def calibration_vectors(name: str, camera: Camera) -> dict[str, NDArray[np.float32]]:
+    """Return a camera's calibration as it is stored: feature -> flat float32 numbers."""
+    numbers = {keys.intrinsics: camera.intrinsics, keys.world_from_cam: camera.world_from_cam}
+    if camera.lens is not None:
+        numbers[keys.distortion] = camera.lens.stored()
+    if camera.depth_sensor is not None:
+        numbers[keys.depth_intrinsics] = camera.depth_sensor.intrinsics
+        numbers[keys.color_from_depth] = camera.depth_sensor.color_from_depth
+    return {key(name): values.astype(np.float32).ravel() for key, values in numbers.items()}
 
 
 def view_features(camera: str, name: str, view: View, workspace: Workspace) -> Features:

@@ -12,9 +12,10 @@ from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, LRSchedulerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
+from lerobot_policy_symview.consistency import CAMERA_IMAGES, POINT_ENCODERS, check_combination, check_view
 from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.methods import METHODS
-from lerobot_policy_symview.symmetry.groups import GROUP_NAMES, make_group
+from lerobot_policy_symview.symmetry.groups import GROUP_NAMES
 from lerobot_policy_symview.symmetry.representations import ThetaRepresentation, VectorRepresentation
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
@@ -23,10 +24,8 @@ from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
 from lerobot_symview.runtime.cli import flagged
 from lerobot_symview.runtime.flag_errors import flag_errors
-from lerobot_symview.views import VIEWS, View, ViewSpec, other_cameras
+from lerobot_symview.views import View, ViewSpec, other_cameras
 
-CAMERA_IMAGES = ("side", "top")  # a camera's own image in place of a view
-POINT_ENCODERS = ("voxel", "point_cloud")  # lift the camera's image to points in space
 RAY_CHANNELS = 6  # Plücker coordinates
 CROP_SIZES = (64, 128)  # every pooling halves an even size, which keeps D4 exact; the last 8 px become 6, 3, 1
 CHOICES: dict[str, tuple[Any, ...]] = {
@@ -89,6 +88,9 @@ class SymviewConfig(PreTrainedConfig):
     """Loss weight of the differences between orientations in relaxed layers (paper A.4)."""
     augmentation: Literal["none", "d4", "so2", "o2", "group"] = "none"
     """Transform every training sample, action included, by a random element of D4, SO(2), O(2) or `group`."""
+    camera_augmentation: float = 0.0
+    """Strength of random errors of calibration and depth in training, and of what hides a part of the image; 1 is up to
+    1 cm and 1 degree. Views are made anew for every sample, so the dataset must have the camera's images."""
     learning_rate: float = 1e-3
     """Of Adam."""
     learning_rate_decay: Literal["none", "cosine"] = "none"
@@ -150,6 +152,8 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.weight_averaging must be at least 0 and below 1, got {self.weight_averaging}")
         if not 0 < self.learning_rate < math.inf:
             raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
+        if not 0 <= self.camera_augmentation <= 10:
+            raise ValueError(f"--policy.camera_augmentation must lie in [0, 10], got {self.camera_augmentation}")
         if not 0 <= self.relaxation_weight < math.inf:
             raise ValueError(f"--policy.relaxation_weight must not be negative, got {self.relaxation_weight}")
         with flagged("--policy.workspace"):
@@ -163,72 +167,12 @@ class SymviewConfig(PreTrainedConfig):
                     f"--policy.normalization_mapping must be IDENTITY for {kind}, got "
                     f"{self.normalization_mapping[kind]}: the policy scales it itself, as equivariance requires"
                 )
-        self._check_view()
-        self._check_combination()
+        check_view(self)
+        check_combination(self)
         _ = self.actions, self.states  # checked when they are parsed
 
     def _check_choice(self, name: str, choices: tuple[Any, ...]) -> None:
         check_name(f"--policy.{name}", str(getattr(self, name)), map(str, choices))
-
-    def _check_view(self) -> None:
-        if self.is_computed:
-            check_name("--policy.view", self.view.name, (*CAMERA_IMAGES, *VIEWS))
-            if self.view.name in VIEWS.builtin:  # other packages' views are imported when they are made
-                with flagged(f"--policy.view={self.view.name}"):
-                    self.make_view()
-        elif self.view.options:
-            raise ValueError(f"--policy.view={self.view.name} is a camera's image and has no options: {self.view}")
-
-    def _check_combination(self) -> None:
-        if (self.encoder == "plain") != (self.group == "C1"):
-            raise ValueError(
-                f"--policy.encoder={self.encoder} cannot have --policy.group={self.group}: "
-                "only the plain encoder has the group C1"
-            )
-        if self.encoder in ("relaxed", *POINT_ENCODERS) and not make_group(self.group).is_exact:
-            raise ValueError(
-                f"--policy.encoder={self.encoder} has filters of single pixels, which rotations by 45 degrees do not "
-                f"map onto each other: use --policy.group=D4, got {self.group}"
-            )
-        if self.sees_points and (self.view.name, self.modality, self.gripper_input) != ("side", "rgbd", "vector"):
-            raise ValueError(
-                f"--policy.encoder={self.encoder} lifts the camera's own image: use --policy.view=side, "
-                f"--policy.modality=rgbd and --policy.gripper_input=vector, got {self.view.name}, {self.modality} and "
-                f"{self.gripper_input}"
-            )
-        if self.is_computed and self.modality == "rgbd" and self.height_key is None:
-            raise ValueError(f"the view {self.view.name!r} has no height map: use --policy.modality=rgb")
-        if self.view.name == "side" and self.gripper_input == "image":
-            raise ValueError(
-                "--policy.gripper_input=image draws a top-down image of the gripper, which does not fit "
-                "--policy.view=side: use --policy.gripper_input=vector, or --policy.method=sideview_equi for both"
-            )
-        if self.camera_rays and (self.view.name, self.encoder) != ("side", "plain"):
-            raise ValueError(
-                "--policy.camera_rays=true gives the rays of the camera's own image, which are no scalars: use "
-                f"--policy.view=side and --policy.encoder=plain, got {self.view.name} and {self.encoder}"
-            )
-        missing = [label for label in keys.STATE_NAMES if label not in self.state_symmetry]
-        if self.gripper_input == "image" and missing:
-            raise ValueError(
-                f"--policy.gripper_input=image draws the gripper's {', '.join(keys.STATE_NAMES)}; "
-                f"--policy.state_symmetry={self.state_symmetry} lacks {missing}: use --policy.gripper_input=vector"
-            )
-        if self.augmentation != "none":
-            self._check_augmentation()
-
-    def _check_augmentation(self) -> None:
-        if self.augmentation == "group" and self.group == "C1":
-            raise ValueError(
-                "--policy.augmentation=group is the identity with --policy.group=C1: "
-                "use --policy.augmentation=d4, so2 or o2"
-            )
-        if self.gripper_input == "none" or not self.states.of_type("yaw"):
-            raise ValueError(
-                f"--policy.augmentation={self.augmentation} rotates the gripper with the scene, but its yaw is not an "
-                f"input of the network with --policy.gripper_input={self.gripper_input} and --policy.state_symmetry="
-                f"{self.state_symmetry}: make a yaw an input, or use --policy.augmentation=none"
-            )
 
     @property
     def actions(self) -> VectorRepresentation:

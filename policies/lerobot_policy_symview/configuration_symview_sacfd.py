@@ -51,6 +51,10 @@ class SymviewSacfdConfig(SymviewConfig):
     def check(self) -> None:
         """Check the fields of all policies and those of soft actor-critic."""
         super().check()
+        if self.camera_augmentation:
+            raise ValueError(
+                "--policy.camera_augmentation is for cloned policies: simulators give views in place of images"
+            )
         if self.check_camera:
             raise ValueError("--policy.check_camera is for cloned policies: simulators give views in place of images")
         self._check_choice("target_update", ("polyak", "hard"))

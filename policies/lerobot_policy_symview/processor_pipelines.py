@@ -46,6 +46,7 @@ def make_processors(
                 calibration=config.camera_calibration,
                 gripper=config.gripper_indices,
                 depth_units=_delivered_units(config) if depth_units is None else depth_units,
+                augmentation=config.camera_augmentation,
             ),
             steps.normalize,
         ],

@@ -11,11 +11,12 @@ from weakref import WeakValueDictionary
 import numpy as np
 import torch
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
-from lerobot.lerobot_types import RobotObservation
+from lerobot.lerobot_types import RobotObservation, TransitionKey
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_policy_symview.inputs.camera_augmentation import augment
 from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
@@ -68,6 +69,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
             not stored in checkpoints: LeRobot's loader delivers millimetres where an environment delivers metres. Units
             that are not given are the calibration's; else, for the cameras of views, the one that shows the table at
             z = 0; else they are inferred from the values. What is inferred is logged.
+        augmentation: strength of random errors of the cameras, for observations with an action, whose views are then
+            made anew (`lerobot_policy_symview.inputs.camera_augmentation`).
 
     Raises (from `observation`):
         CalibrationError: if the first observation contradicts the calibration: the camera is below the table, too far
@@ -80,6 +83,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
     calibration: dict[str, Any] = field(default_factory=dict)
     gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
     depth_units: dict[str, Any] = field(default_factory=dict)
+    augmentation: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.views, list | tuple):
@@ -113,22 +117,34 @@ class ViewsProcessorStep(ObservationProcessorStep):
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
         observation = self._in_metres(self._own_names(observation))
+        is_augmented = self.augmentation > 0 and self._is_training
+        if is_augmented:
+            stored = [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
+            observation = {key: values for key, values in observation.items() if key not in stored}
         missing = {
             name: view
             for name, view in self._views.items()
             if not all(keys.view(self.camera, output) in observation for output in view.outputs)
         }
+        if missing and not self._checked:
+            self._check(self._batches(observation, missing))
+            self._checked = True
+        if is_augmented:
+            observation = augment(observation, self._observed.values(), self.augmentation)
         if not missing:
             return observation
         batches = self._batches(observation, missing)
-        if not self._checked:
-            self._check(batches)
-            self._checked = True
         for name, view in missing.items():
             for output, images in self._rendered(name, view, self._merged(view, batches)).items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
                 observation.setdefault(keys.view(self.camera, output), made)
         return observation
+
+    @property
+    def _is_training(self) -> bool:
+        """Whether the observations have actions, as those of a dataset do."""
+        transition = getattr(self, "_current_transition", None)
+        return transition is not None and transition.get(TransitionKey.ACTION) is not None
 
     def reset(self) -> None:
         """Start an episode: views with memory forget the frames of the last one."""

@@ -45,6 +45,7 @@ WRONG = {
         "action_symmetry": (["height"], r"--policy.action_symmetry has unknown types \['height'\], expected any of"),
         "workspace": ({"size": -1}, "--policy.workspace: workspace size and height_limit must be positive.*got -1"),
         "calibration": ({"units": "cm"}, "--policy.calibration: units must be m or mm, got 'cm'"),
+        "camera_augmentation": (11, "--policy.camera_augmentation must lie in"),
         "check_camera": ("perhaps", "check_camera.*'perhaps'"),
         "normalization_mapping": ({"STATE": "MIN_MAX"}, "--policy.normalization_mapping must be IDENTITY for STATE"),
         "learning_rate_decay": ("linear", "learning_rate_decay.*'linear'.*cosine"),

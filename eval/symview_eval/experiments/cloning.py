@@ -29,6 +29,8 @@ from symview_eval.experiments.results import Checkpoint, Times, checkpoint
 from symview_sim.settings import EnvSettings
 from symview_sim.simulators import Simulators
 
+AUGMENTED_VARIANTS = 16  # of every frame, with camera augmentation; LeRobot's training makes a new one each time
+
 
 @dataclass(frozen=True)
 class CloningResult:
@@ -44,16 +46,19 @@ class Demonstrations:
 
     Args:
         dataset: a `LeRobotDataset` with the camera's images.
-        actor: the policy; its preprocessor, which renders the view, runs once per frame.
+        actor: the policy; its preprocessor, which renders the view, runs once per frame, or with camera augmentation as
+            often as there are variants.
     """
 
     def __init__(self, dataset: Any, actor: Actor):
         self._device = torch.device(actor.policy.config.device)
         self._codec = ObservationCodec(actor.policy.scene)
         frames, actions = [], []
-        for observation, action in observations(dataset):
-            frames += self._codec.pack(actor.preprocessor(observation))
-            actions.append(action)
+        for _ in range(AUGMENTED_VARIANTS if actor.policy.config.camera_augmentation else 1):
+            for observation, action in observations(dataset):
+                # with actions, as in training: the preprocessor augments observations that have some
+                frames += self._codec.pack(actor.preprocessor(observation | {keys.ACTION: action}))
+                actions.append(action)
         self._frames = {
             name: torch.stack([torch.from_numpy(frame[name]) for frame in frames]).to(self._device)
             for name in frames[0]

@@ -44,6 +44,11 @@ def read_features(config: SymviewConfig, features: Features) -> None:
             f"the dataset has {sorted(key for key in features if 'images' in key)}: "
             "for the view of another camera, give its name by --policy.camera"
         )
+    if config.camera_augmentation and not has_raw:
+        raise ValueError(
+            f"--policy.camera_augmentation makes views anew from {config.all_raw_keys}, which the dataset lacks: keep "
+            "the camera's images when adding views"
+        )
     if config.remembers and config.color_key not in features:
         raise ValueError(
             f"--policy.view={config.view.name} with memory=true is made from the frames of an episode in order, which "
