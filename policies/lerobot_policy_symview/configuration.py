@@ -112,7 +112,8 @@ class SymviewConfig(PreTrainedConfig):
 
     check_camera: bool = False
     """Keep the camera's first image of the demonstrations, and compare the first observation with it: warn of a camera
-    that was moved, and do not act on an image that shows something else. For a camera with one calibration."""
+    that was moved, and do not act on an image that shows something else, or on a black view. For a camera with one
+    calibration."""
 
     # The policy scales states and actions itself, in a way that commutes with the group; per-axis statistics do not.
     normalization_mapping: dict[str, NormalizationMode] = field(

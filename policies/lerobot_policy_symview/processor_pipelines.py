@@ -47,6 +47,7 @@ def make_processors(
                 gripper=config.gripper_indices,
                 depth_units=_delivered_units(config) if depth_units is None else depth_units,
                 augmentation=config.camera_augmentation,
+                require_views=config.check_camera,
             ),
             steps.normalize,
         ],

@@ -71,10 +71,12 @@ class ViewsProcessorStep(ObservationProcessorStep):
             z = 0; else they are inferred from the values. What is inferred is logged.
         augmentation: strength of random errors of the cameras, for observations with an action, whose views are then
             made anew (`lerobot_policy_symview.inputs.camera_augmentation`).
+        require_views: raise an error for a black view of an observation without an action; by default, warn once.
 
     Raises (from `observation`):
         CalibrationError: if the first observation contradicts the calibration: the camera is below the table, too far
-            away for the workspace, or its depth shows the table elsewhere or nothing.
+            away for the workspace, or its depth shows the table elsewhere or nothing; with `require_views`, if a view
+            is black.
     """
 
     views: list[Any] = field(default_factory=list)
@@ -84,6 +86,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
     gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
     depth_units: dict[str, Any] = field(default_factory=dict)
     augmentation: float = 0.0
+    require_views: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.views, list | tuple):
@@ -109,6 +112,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._logged: set[tuple[str, float]] = set()
         self._substitutes: set[str] = set()
         self._absent: set[str] = set()
+        self._black: set[str] = set()
         self._episodes: dict[str, list[Renderer]] = {}
         if any(view.memory for view in self._views.values()):
             _REMEMBERING[id(self)] = self
@@ -135,7 +139,10 @@ class ViewsProcessorStep(ObservationProcessorStep):
             return observation
         batches = self._batches(observation, missing)
         for name, view in missing.items():
-            for output, images in self._rendered(name, view, self._merged(view, batches)).items():
+            rendered = self._rendered(name, view, self._merged(view, batches))
+            if not self._is_training:
+                self._report_black(name, rendered[next(iter(view.outputs))])
+            for output, images in rendered.items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
                 observation.setdefault(keys.view(self.camera, output), made)
         return observation
@@ -250,6 +257,20 @@ class ViewsProcessorStep(ObservationProcessorStep):
             ceiling = None if gripper is None else float(gripper[0, 2])
             cameras = {name: batch.cameras[0] for name, batch in batches.items()}
             report_agreement(depths, cameras, self._workspace, ceiling)
+
+    def _report_black(self, name: str, images: Tensor) -> None:
+        """Raise a CalibrationError, or warn once, if a view is black in some frame."""
+        if bool((images != 0).flatten(1).any(1).all()):
+            return
+        problem = (
+            f"the view {name!r} of camera {self.camera!r} is black: the camera delivers no image or depth of the "
+            "workspace, or something hides all of it"
+        )
+        if self.require_views:
+            raise CalibrationError(problem)
+        if name not in self._black:
+            self._black.add(name)
+            logger.warning("%s", problem)
 
     def _batches(self, observation: RobotObservation, views: dict[str, View]) -> dict[str, FrameBatch]:
         """Return the images of the cameras that views need and the observation has, by name."""

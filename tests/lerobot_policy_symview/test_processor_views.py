@@ -355,3 +355,20 @@ def test_images_of_another_size_than_calibrated_raise(observed):
     small = {key: value[..., ::2, ::2] if "images" in key else value for key, value in observed.items()}
     with pytest.raises(CalibrationError, match="calibrated for 152 x 152 pixels, the observation has 76 x 76"):
         step.observation(without_calibration(small))
+
+
+@pytest.mark.parametrize("name", ["reproj", "persp"])
+def test_a_view_that_turns_black_warns_once_or_raises(observed, name, caplog):
+    """The first frame is right; then the lens is covered, or depth has no valid pixel."""
+    views = [{"name": name, "size": 32}]
+    dark = observed | {key: torch.zeros_like(observed[key]) for key in (keys.rgb("side"), keys.depth("side"))}
+    step, strict = ViewsProcessorStep(views=views), ViewsProcessorStep(views=views, require_views=True)
+    for each in (step, strict):
+        each.observation(dict(observed))
+    for _ in range(2):
+        assert not step.observation(dict(dark))[keys.view("side", name)].any()
+    assert caplog.text.count(f"the view '{name}' of camera 'side' is black") == 1
+    with pytest.raises(CalibrationError, match=f"the view '{name}' of camera 'side' is black"):
+        strict.observation(dict(dark))
+    training = {"observation": dict(dark), "action": torch.zeros(1, 5)}
+    assert not strict(training)["observation"][keys.view("side", name)].any()
