@@ -21,7 +21,7 @@ from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, 
 if TYPE_CHECKING:
     from lerobot_symview.geometry.memory import Memory
 
-INFILLS = ("nearest", "occlusion", "local", "none")
+INFILLS = ("nearest", "occlusion", "splat", "local", "none")
 
 
 class Reprojection(NamedTuple):
@@ -103,9 +103,10 @@ class ReprojectedView(View):
 
     size: int = 152
     """Rows and columns."""
-    infill: Literal["nearest", "occlusion", "local", "none"] = "nearest"
+    infill: Literal["nearest", "occlusion", "splat", "local", "none"] = "nearest"
     """Infill of pixels without a point: nearest point (the paper's best); the same, but what is behind an object in its
-    shadow (occlusion); mean of a 5 x 5 window; or none (black)."""
+    shadow (occlusion); the point whose footprint covers the pixel, else as occlusion (splat); mean of a 5 x 5 window;
+    or none (black)."""
     clip: Literal["gripper", "none"] | float = "gripper"
     """`gripper` removes points above the gripper, and with them the arm, if the gripper's state is known; `none` keeps
     all points; a number removes points above that height, metres."""
@@ -198,31 +199,34 @@ class ReprojectedView(View):
 
     def _render(self, frame: Frame, memory: Memory | None) -> tuple[dict[str, NDArray], Memory | None]:
         """Return the outputs and, with the option, the memory of the episode after this frame."""
-        from lerobot_symview.geometry import fusion, infill, occlusion, zbuffer  # slow import: numba
+        from lerobot_symview.geometry import fusion, infill, occlusion, splat, zbuffer  # slow import: numba
         from lerobot_symview.geometry.memory import Memory, recall
 
         ceiling = self.ceiling(frame.gripper_height)
         sources = [self._source(one) for one in self.merged(frame)]
+        depths, cameras = [source.depth for source in sources], [source.camera for source in sources]
         buffers = [
-            zbuffer.zbuffer_from_depth(source.depth, source.camera, frame.workspace, self.size, ceiling)
-            for source in sources
+            zbuffer.zbuffer_from_depth(depth, camera, frame.workspace, self.size, ceiling)
+            for depth, camera in zip(depths, cameras, strict=True)
         ]
         buffer = buffers[0]
         if len(buffers) > 1:
-            buffer = fusion.fuse_buffers(buffers, [source.camera for source in sources], frame.workspace)
-        seen = known = buffer.source != zbuffer.EMPTY
+            buffer = fusion.fuse_buffers(buffers, cameras, frame.workspace)
+        seen = buffer.source != zbuffer.EMPTY
+        if self.infill == "splat":
+            buffer = splat.with_splats(buffer, depths, cameras, frame.workspace)
+        known = buffer.source != zbuffer.EMPTY
         colors_of = [source.rgb for source in sources]
         age = None
         if self.memory:
-            depths, cameras = [source.depth for source in sources], [source.camera for source in sources]
             buffer, age = recall(memory, buffer, depths, cameras, frame.workspace, frame.gripper)
             colors_of += [] if memory is None else [memory.rgb]
             known = buffer.source != zbuffer.EMPTY
-        is_nearest = self.infill in ("nearest", "occlusion")
+        is_nearest = self.infill in ("nearest", "occlusion", "splat")
         shown = infill.nearest_known(known) if is_nearest else _identity_cells(self.size)
-        if self.infill == "occlusion":
-            for source in sources:
-                shown = occlusion.without_smear(shown, buffer, source.depth, source.camera, frame.workspace)
+        if self.infill in ("occlusion", "splat"):
+            for depth, camera in zip(depths, cameras, strict=True):
+                shown = occlusion.without_smear(shown, buffer, depth, camera, frame.workspace)
         colors, height = zbuffer.gather(shown, buffer, colors_of)
         remembered = None if age is None else Memory(colors.copy(), height.copy(), age)  # infill changes no known cell
         if self.infill == "local":

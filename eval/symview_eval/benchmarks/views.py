@@ -43,6 +43,7 @@ VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
     "reproject_nearest": ("reproj", {}),
     "reproject_none": ("reproj", {"infill": "none"}),
     "reproject_occlusion": ("reproj", {"infill": "occlusion"}),
+    "reproject_splat": ("reproj", {"infill": "splat"}),
     "reproject_local": ("reproj", {"infill": "local"}),
     "reproject_scale_2": ("reproj", {"source_scale": 2}),
     "perspective": ("persp", {"gripper": False}),
@@ -215,6 +216,7 @@ def real_camera_times(repeats: int) -> dict[str, float]:
     calls["vga_unaligned"] = render_unaligned
     other = _table_frame(CameraSpec(height=480, width=640, azimuth_deg=90.0).place(workspace), workspace)
     calls |= {"episode": _episode(view, frames["vga"]), "memory": _episode(replace(view, memory=True), frames["vga"])}
+    calls["splat"] = partial(replace(view, infill="splat").render, frames["vga"])
     calls["fused"] = partial(view.render, replace(frames["vga"], others={"left": other}))
     for call in calls.values():
         call()
@@ -222,7 +224,7 @@ def real_camera_times(repeats: int) -> dict[str, float]:
     results: dict[str, float] = {}
     for name in calls:
         results |= _median_and_quartiles(f"{name}_ms", [times[name] for times in rounds])
-    for name in ("vga_lens", "vga_unaligned", "fused"):
+    for name in ("vga_lens", "vga_unaligned", "fused", "splat"):
         results |= _median_and_quartiles(f"{name}_ratio", [times[name] / times["vga"] for times in rounds])
     results |= _median_and_quartiles("memory_ratio", [times["memory"] / times["episode"] for times in rounds])
     return results

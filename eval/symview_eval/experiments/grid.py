@@ -207,7 +207,8 @@ PLACEMENTS = (
 )
 
 
-WITH_ERRORS = (REPROJ, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
+AUGMENTED = _row("reproj_equi_augmented", "Reproj. Equi, camera augmentation", "reproj_equi", camera_augmentation=1.0)
+WITH_ERRORS = (REPROJ, AUGMENTED, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
 SENSORS = (
     ("exact", CameraSpec()),
     *((f"position {100 * metres:g} cm", _miscalibrated(position=metres)) for metres in (0.005, 0.01, 0.02, 0.03)),
@@ -279,6 +280,12 @@ EXPERIMENTS = {
                     "Nearest, or behind the occluder",
                     "reproj_equi",
                     view_options={"infill": "occlusion"},
+                ),
+                _row(
+                    "reproj_equi_splat",
+                    "Footprints of pixels, or behind the occluder",
+                    "reproj_equi",
+                    view_options={"infill": "splat"},
                 ),
                 _row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
                 _row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),

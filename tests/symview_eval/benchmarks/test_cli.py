@@ -54,9 +54,9 @@ def test_the_views_benchmark_names_every_ratio(monkeypatch, capsys):
         cli.main()
     assert end.value.code == 0
     results = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert {f"{name}_{unit}" for name in ("vga_lens", "vga_unaligned", "fused") for unit in ("ms", "ratio")} <= set(
-        results
-    )
+    assert {
+        f"{name}_{unit}" for name in ("vga_lens", "vga_unaligned", "fused", "splat") for unit in ("ms", "ratio")
+    } <= set(results)
     assert {"vga_ms", "hd_ms", "memory_ratio"} <= set(results)
     expected = {"offline_codec_share", "offline_two_process_speedup", "frames_per_s", "floor_ratio", "warp_us"}
     assert expected | {f"{name}_ratio" for name in views_benchmark.VIEWS} <= set(results)
