@@ -56,10 +56,13 @@ def make_processors(
 
 
 def changed_options(config: SymviewConfig, saved: dict[str, Any]) -> list[str]:
-    """Return the options of the added step that flags or a dataset gave another value than a checkpoint's `saved`."""
+    """Return the options of the added step that flags or a dataset gave another value than a checkpoint's `saved`.
+
+    Options that the checkpoint does not have yet had their defaults.
+    """
     step = next(step for step in make_processors(config)[0].steps if isinstance(step, ViewsProcessorStep))
-    options = json.loads(json.dumps(step.get_config()))
-    return [name for name, value in options.items() if saved.get(name) != value]
+    options, defaults = (json.loads(json.dumps(one.get_config())) for one in (step, ViewsProcessorStep()))
+    return [name for name, value in options.items() if saved.get(name, defaults[name]) != value]
 
 
 def _delivered_units(config: SymviewConfig) -> dict[str, float]:
