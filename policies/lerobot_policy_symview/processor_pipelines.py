@@ -10,7 +10,8 @@ from lerobot.processor import PolicyAction, PolicyProcessorPipeline
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.processor_views import ViewsProcessorStep, delivered_units
+from lerobot_policy_symview.inputs.depth_reader import delivered_units
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
 
 def make_processors(

@@ -17,21 +17,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_policy_symview.inputs.camera_augmentation import augment
+from lerobot_policy_symview.inputs.depth_reader import DepthReader
 from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
-from lerobot_symview.datasets.features import declared_unit
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.units import (
-    ABOVE_MINIMUM,
     METRES,
-    MILLIMETRES,
-    VIDEO_MINIMUM,
-    infer_depth_unit,
-    infer_height_unit,
     parse_unit,
-    unit_name,
-    units_per_metre,
 )
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
 from lerobot_symview.views import Frame, View, ViewSpec, make_views, other_cameras
@@ -43,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 Renderer = Callable[[Frame], dict[str, NDArray[Any]]]
 _REMEMBERING: WeakValueDictionary[int, ViewsProcessorStep] = WeakValueDictionary()
-IN_METRES = "observation.depth_in_metres"  # marks observations whose depth a step has brought to metres
 
 
 @dataclass
@@ -105,11 +97,9 @@ class ViewsProcessorStep(ObservationProcessorStep):
             if observed.fixed is not None:
                 check_camera(name, observed.fixed, self._workspace, minimum=LEAST_VISIBLE)
         calibrated = calibration.depth_units if calibration else {}
-        self._units = {keys.depth(name): unit for name, unit in calibrated.items() if name in self._observed}
-        self._units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
-        self._table_units: dict[tuple[str, torch.dtype], float] = {}
-        self._read_units: dict[str, float] = {}
-        self._logged: set[tuple[str, float]] = set()
+        units = {keys.depth(name): unit for name, unit in calibrated.items() if name in self._observed}
+        units |= {key: parse_unit(unit) for key, unit in self.depth_units.items()}
+        self._depth = DepthReader(units, self._observed, self._workspace)
         self._substitutes: set[str] = set()
         self._absent: set[str] = set()
         self._black: set[str] = set()
@@ -120,7 +110,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
-        observation = self._in_metres(self._own_names(observation))
+        observation = self._depth.in_metres(self._own_names(observation))
         is_augmented = self.augmentation > 0 and self._is_training
         if is_augmented:
             stored = [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
@@ -186,50 +176,6 @@ class ViewsProcessorStep(ObservationProcessorStep):
         features = [keys.rgb(self.camera), keys.depth(self.camera), *keys.calibration(self.camera), *made]
         return keys.as_camera(observation, self.camera, others[0], features)
 
-    def _in_metres(self, observation: RobotObservation) -> RobotObservation:
-        """Convert all depth and height images to float metres, once per observation."""
-        if IN_METRES in observation:
-            return observation
-        images = {
-            key: values.detach()
-            for key, values in observation.items()
-            if key.startswith(keys.IMAGES) and key.endswith(("_depth", "_height"))
-        }
-        if not images:
-            return observation
-        self._read_units = {key: self._unit(key, values, observation) for key, values in images.items()}
-        converted = {key: _metres(values, self._read_units[key]) for key, values in images.items()}
-        converted |= {key: _without_minimum(depth) for key, depth in converted.items() if key.endswith("_depth")}
-        return {**observation, **converted, IN_METRES: torch.ones(())}
-
-    def _unit(self, key: str, values: Tensor, observation: RobotObservation) -> float:
-        unit = self._units.get(key) or self._table_units.get((key, values.dtype))
-        if unit is not None:
-            return unit
-        camera = self._observed.get(key.removeprefix(keys.IMAGES).removesuffix("_depth"))
-        if camera is not None and (unit := self._unit_by_table(camera, values, observation)) is not None:
-            self._table_units[key, values.dtype] = unit
-            logger.info("%s declares no unit: the table at z = 0 shows %s", key, unit_name(unit))
-            return unit
-        unit = (infer_height_unit if key.endswith("_height") else infer_depth_unit)(values)
-        if values.is_floating_point() and (key, unit) not in self._logged:
-            self._logged.add((key, unit))
-            logger.info("%s declares no unit: its values are taken to be %s", key, unit_name(unit))
-        return unit
-
-    def _unit_by_table(self, observed: ObservedCamera, depth: Tensor, observation: RobotObservation) -> float | None:
-        from lerobot_symview.calibration.table_plane import likely_depth_unit
-
-        color = observation.get(keys.rgb(observed.name))
-        if observed.missing_matrices(observation) or not depth.numel() or color is None:
-            return None
-        camera = observed.cameras(observation)[0]
-        if camera.depth_sensor is None and depth.shape[-2:] != color.shape[-2:]:
-            return None  # `aligned_depth` rejects it
-        height, width = depth.shape[-2:]
-        image = depth[0].reshape(height, width).cpu().numpy()
-        return likely_depth_unit(image, camera.depth_camera(height, width), self._workspace)
-
     def _check(self, batches: dict[str, FrameBatch]) -> None:
         """Raise a CalibrationError if the first frame contradicts a camera's calibration; report how cameras agree."""
         from lerobot_symview.calibration.agreement import report_agreement
@@ -249,7 +195,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
                 logger.warning("%s", problem)
                 continue
             try:
-                check_table(depths[name], camera, self._workspace, self._read_units.get(key, METRES))
+                check_table(depths[name], camera, self._workspace, self._depth.units.get(key, METRES))
             except CalibrationError as error:
                 raise CalibrationError(f"{key}: {error}") from None
         if len(depths) > 1:
@@ -340,40 +286,6 @@ def start_episodes() -> None:
     """
     for step in list(_REMEMBERING.values()):
         step.reset()
-
-
-def delivered_units(meta: Any) -> dict[str, float]:
-    """Return the metres per unit in which LeRobot's loader delivers each depth feature that declares its unit.
-
-    The loader converts to `--dataset.depth_output_unit`, which it does not pass on; it rescales the statistics to the
-    same unit, so these tell (`LeRobotDatasetMetadata.rescale_depth_stats`).
-
-    Args:
-        meta: of the `LeRobotDataset`.
-    """
-    from lerobot.datasets.io_utils import load_stats
-
-    stored_stats = load_stats(meta.root) or {}
-    units: dict[str, float] = {}
-    for key in meta.depth_keys:
-        unit = declared_unit(meta.features[key])
-        if unit is None or key not in stored_stats or key not in (meta.stats or {}):
-            continue
-        same = np.allclose(meta.stats[key]["max"], stored_stats[key]["max"])
-        units[key] = unit if same else (METRES if unit == MILLIMETRES else MILLIMETRES)
-    return units
-
-
-def _metres(depth: Tensor, unit: float) -> Tensor:
-    depth = depth if depth.is_floating_point() else depth.float()
-    # By a tensor: by a plain number a GPU may multiply with the rounded reciprocal, which rounds differently.
-    return depth if unit == METRES else depth / depth.new_full((), units_per_metre(unit))
-
-
-def _without_minimum(depth: Tensor) -> Tensor:
-    """Return depth in metres with 0 for the pixels that LeRobot's depth videos clip to their minimum."""
-    is_lost = (depth - VIDEO_MINIMUM).abs() <= VIDEO_MINIMUM * (ABOVE_MINIMUM - 1)
-    return torch.where(is_lost, torch.zeros_like(depth), depth)
 
 
 def _frames(batch: FrameBatch) -> list[Frame]:

@@ -6,8 +6,9 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
+from lerobot_policy_symview.inputs.depth_reader import IN_METRES, delivered_units
 from lerobot_policy_symview.processor_pipelines import make_processors
-from lerobot_policy_symview.processor_views import IN_METRES, ViewsProcessorStep, delivered_units
+from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_policy_symview.rl.rollouts import simulator_config
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError
