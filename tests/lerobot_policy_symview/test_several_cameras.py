@@ -3,6 +3,7 @@
 import logging
 import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.scripts import lerobot_eval
 
 from lerobot_policy_symview import SymviewEnvConfig, ViewsProcessorStep
+from lerobot_policy_symview.rl.demonstrations import check_scene
 from lerobot_symview import keys, reproject, warp_table
 from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
 from lerobot_symview.datasets.add_views import add_views
@@ -265,3 +267,14 @@ def test_a_dataset_without_the_camera_is_refused(two_cameras, tmp_path):
     with pytest.raises(DatasetError, match=r"lacks observation\.images\.right, observation\.images\.right_depth"):
         add_views(merging(two_cameras, tmp_path / "never", views=views))
     assert not list(tmp_path.glob("never*"))
+
+
+def test_reinforcement_learning_needs_the_cameras_of_the_demonstrations(two_cameras):
+    dataset = LeRobotDataset("test/two", root=two_cameras)
+    env = EnvSettings("block_pushing", camera=SIDE)
+    with pytest.raises(ValueError, match=r"view merges left: give --env\.more_cameras"):
+        check_scene(dataset, env, "side", ["left"])
+    moved = replace(env, more_cameras=(replace(LEFT, azimuth_deg=60.0),))
+    with pytest.raises(ValueError, match=r"--env\.more_cameras: left\.azimuth_deg is 60\.0, the dataset has 90\.0"):
+        check_scene(dataset, moved, "side", ["left"])
+    check_scene(dataset, replace(env, more_cameras=(LEFT,)), "side", ["left"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -41,11 +41,17 @@ def open_dataset(target: DatasetLocation) -> Any:
     return dataset
 
 
-def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
-    """Check that a dataset's workspace, task, robot and camera are those to simulate.
+def check_scene(dataset: Any, env: EnvSettings, camera: str, merged: Sequence[str] = ()) -> None:
+    """Check that a dataset's workspace, task, robot and cameras are those to simulate.
 
     A dataset without `meta/symview_recording.json`, such as a merged one, may have several tasks, robots and cameras;
     they are not checked.
+
+    Args:
+        dataset: a `LeRobotDataset`.
+        env: what is to be simulated.
+        camera: the policy's.
+        merged: further cameras that its view merges.
 
     Raises:
         ValueError: if not; the message lists the flags that differ.
@@ -53,6 +59,9 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
     simulated = {spec.name: spec for spec in env.all_cameras}
     if camera not in simulated:
         raise ValueError(f"--policy.camera={camera} is not simulated; --env.camera.name is {env.camera.name!r}")
+    missing = [name for name in merged if name not in simulated]
+    if missing:
+        raise ValueError(f"the policy's view merges {', '.join(missing)}: give --env.more_cameras")
     info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
     recorded = read_settings(Path(dataset.root), RECORDING).get("env", {})
     cameras = {spec["name"]: spec for spec in (recorded["camera"], *recorded["more_cameras"])} if recorded else {}
@@ -61,6 +70,7 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str) -> None:
         ("--env", {"task": env.task, "robot": env.robot}, recorded),
         ("--env.workspace", asdict(env.workspace), info.get("symview", {}).get("workspace", {})),
         ("--env.camera", asdict(simulated[camera]), cameras.get(camera, {})),
+        *((f"--env.more_cameras: {name}", asdict(simulated[name]), cameras.get(name, {})) for name in merged),
     ):
         pairs |= {f"{flag}.{name}": (value, theirs[name]) for name, value in plain(ours).items() if name in theirs}
     differing = [

@@ -57,6 +57,7 @@ class Training:
         space: Any = config.env.make().action_space
         policy = deepcopy(config.policy)
         policy.set_dataset_feature_metadata(dataset.meta.features)
+        check_scene(dataset, config.env, policy.camera, policy.merged_cameras)  # which the dataset's view may tell
         policy.limit_view()
         self.policy = SymviewSacfdPolicy(policy, ranges(dataset, (space.low, space.high)))
         self.policy.to(policy.device)
