@@ -55,6 +55,7 @@ def zbuffer_from_depth(
     workspace: Workspace,
     pixels: int,
     ceiling: float = np.inf,
+    floor: float = -np.inf,
 ) -> ZBuffer:
     """Render a depth image into a top-down z-buffer (paper Eq. 2-6).
 
@@ -66,6 +67,7 @@ def zbuffer_from_depth(
         workspace: the square on the table that the grid covers.
         pixels: rows and columns of the grid.
         ceiling: metres above the table; higher points are ignored.
+        floor: metres above the table, negative below it; lower points are ignored.
 
     Returns:
         A buffer whose source is the row-major index of the pixel.
@@ -77,9 +79,9 @@ def zbuffer_from_depth(
         raise ValueError(f"depth has shape {depth.shape}, the camera is {(camera.height, camera.width)}")
     buffer, grid = empty_buffer(pixels), grid_from_pixel(camera, workspace, pixels)
     if camera.lens is None:
-        _draw_depth(depth, *grid, ceiling, *buffer)
+        _draw_depth(depth, *grid, floor, ceiling, *buffer)
     else:
-        _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, ceiling, *buffer)
+        _draw_depth_through_lens(depth, *ideal_pixels(camera.optics), *grid, floor, ceiling, *buffer)
     return buffer
 
 
@@ -148,7 +150,7 @@ def _draw_points(rows_columns, heights, ceiling, height, source):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
-def _draw_depth(depth, rays, origin, ceiling, height, source):  # type: ignore[no-untyped-def]
+def _draw_depth(depth, rays, origin, floor, ceiling, height, source):  # type: ignore[no-untyped-def]
     side = height.shape[0]
     height, source = height.ravel(), source.ravel()
     rows, columns = depth.shape
@@ -160,7 +162,7 @@ def _draw_depth(depth, rays, origin, ceiling, height, source):  # type: ignore[n
             distance = np.float64(depth[v, u])
             if distance > 0.0 and distance < np.inf:
                 z = origin[2] + distance * (rays[2, 0] * u + height_ray)
-                if z <= ceiling:
+                if z <= ceiling and z >= floor:
                     row = origin[0] + distance * (rays[0, 0] * u + row_ray)
                     column = origin[1] + distance * (rays[1, 0] * u + column_ray)
                     cell = _cell(row, column, side)
@@ -171,7 +173,7 @@ def _draw_depth(depth, rays, origin, ceiling, height, source):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True)
-def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, height, source):  # type: ignore[no-untyped-def]
+def _draw_depth_through_lens(depth, us, vs, rays, origin, floor, ceiling, height, source):  # type: ignore[no-untyped-def]
     """Draw as `_draw_depth` does, with the same rounding, but look up the ideal pixels."""
     side = height.shape[0]
     height, source = height.ravel(), source.ravel()
@@ -182,7 +184,7 @@ def _draw_depth_through_lens(depth, us, vs, rays, origin, ceiling, height, sourc
             if distance > 0.0 and distance < np.inf:
                 u, v = us[i, j], vs[i, j]
                 z = origin[2] + distance * (rays[2, 0] * u + (rays[2, 1] * v + rays[2, 2]))
-                if z <= ceiling:
+                if z <= ceiling and z >= floor:
                     row = origin[0] + distance * (rays[0, 0] * u + (rays[0, 1] * v + rays[0, 2]))
                     column = origin[1] + distance * (rays[1, 0] * u + (rays[1, 1] * v + rays[1, 2]))
                     cell = _cell(row, column, side)

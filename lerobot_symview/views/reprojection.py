@@ -114,6 +114,8 @@ class ReprojectedView(View):
     """Distance of the clipping height below the gripper's position, metres, since the fingers reach below it."""
     clip_floor: float = 0.06
     """Lowest clipping height, metres, so that an object at the gripper stays visible."""
+    lowest: float = -0.05
+    """Height, metres, below which points are removed: those of the floor beside a table."""
     flying_limit: float = 0.0
     """Remove points that lie between two surfaces, more than this from both, metres: depth cameras measure them at the
     edges of objects. 0 keeps all; 0.02 is a start for a RealSense."""
@@ -162,7 +164,8 @@ class ReprojectedView(View):
             raise OptionError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
         if not 0 <= self.flying_limit < math.inf:
             raise OptionError(f"flying_limit must be finite metres, at least 0, got {self.flying_limit}")
-        for name, metres in {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor}.items():
+        lengths = {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor, "lowest": self.lowest}
+        for name, metres in lengths.items():
             if not math.isfinite(metres):
                 raise OptionError(f"{name} must be finite metres, got {metres}")
         if self.age and not self.memory:
@@ -206,7 +209,7 @@ class ReprojectedView(View):
         sources = [self._source(one) for one in self.merged(frame)]
         depths, cameras = [source.depth for source in sources], [source.camera for source in sources]
         buffers = [
-            zbuffer.zbuffer_from_depth(depth, camera, frame.workspace, self.size, ceiling)
+            zbuffer.zbuffer_from_depth(depth, camera, frame.workspace, self.size, ceiling, self.lowest)
             for depth, camera in zip(depths, cameras, strict=True)
         ]
         buffer = buffers[0]

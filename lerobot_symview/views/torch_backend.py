@@ -127,7 +127,7 @@ def _zbuffers(view: ReprojectedView, batch: FrameBatch, ceilings: list[float]) -
     if batch.depth is None:
         raise ValueError("the view needs depth")
     depth = without_flying_pixels_batch(batch.depth, view.flying_limit) if view.flying_limit else batch.depth
-    return zbuffer_batch(depth, batch.cameras, batch.workspace, view.size, ceilings)
+    return zbuffer_batch(depth, batch.cameras, batch.workspace, view.size, ceilings, view.lowest)
 
 
 def _fused(
@@ -172,7 +172,7 @@ def without_flying_pixels_batch(depth: Tensor, limit: float) -> Tensor:
 
 
 def zbuffer_batch(
-    depth: Tensor, cameras: list[Camera], workspace: Workspace, pixels: int, ceilings: list[float]
+    depth: Tensor, cameras: list[Camera], workspace: Workspace, pixels: int, ceilings: list[float], floor: float
 ) -> tuple[Tensor, Tensor]:
     """Render each depth image into its own top-down z-buffer, as `zbuffer_from_depth` does.
 
@@ -182,6 +182,7 @@ def zbuffer_batch(
         workspace: the square on the table that the buffers cover.
         pixels: P, rows and columns of a buffer.
         ceilings: B heights, metres, above which points are ignored.
+        floor: height, metres, below which points are ignored.
 
     Returns:
         heights (B, P, P) float32 and sources (B, P, P) int64.
@@ -199,7 +200,7 @@ def zbuffer_batch(
         origin[:, axis] + distance * (rays[:, axis, 0] * u + (rays[:, axis, 1] * v + rays[:, axis, 2]))
         for axis in range(3)
     )
-    valid = (distance > 0) & (distance < torch.inf) & (z <= ceiling[:, None, None])
+    valid = (distance > 0) & (distance < torch.inf) & (z <= ceiling[:, None, None]) & (z >= floor)
     valid &= (row >= 0) & (column >= 0) & (row < pixels) & (column < pixels)
     cell = torch.where(valid, row, 0.0).long() * pixels + torch.where(valid, column, 0.0).long()
     heights = torch.where(valid, z, 0.0).float()

@@ -104,6 +104,7 @@ WRONG = {
         "reproj.clip": (NAN, "env.*reproj.*clip must be gripper, none or a height in metres, got nan"),
         "reproj.clip_margin": (NAN, "env.*reproj.*clip_margin must be finite metres, got nan"),
         "reproj.clip_floor": (NAN, "env.*reproj.*clip_floor must be finite metres, got nan"),
+        "reproj.lowest": (NAN, "env.*reproj.*lowest must be finite metres, got nan"),
         "reproj.flying_limit": (-1.0, "env.*reproj.*flying_limit must be finite metres, at least 0, got -1"),
         "reproj.source_scale": (9, "env.*reproj.*source_scale must be an integer from 1 to 8, got 9"),
         "reproj.height": ("perhaps", "reproj.height.*'perhaps'"),

@@ -24,6 +24,7 @@ OPTIONS = [
     ("persp", {}),
     ("persp", {"plane_height": "gripper", "gripper": False}),
     ("reproj", {"flying_limit": 0.05}),
+    ("reproj", {"lowest": 0.02, "clip": 0.3}),
     ("reproj", {"cameras": ["left", "back"]}),
     ("persp", {"cameras": ["left", "back"]}),
 ]
