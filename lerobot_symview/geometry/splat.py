@@ -69,37 +69,47 @@ def _is_beside_empty(points, row, column):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _draw_footprints(depth, us, vs, rays, origin, first, points, height, source):  # type: ignore[no-untyped-def]
     side, columns = height.shape[0], depth.shape[1]
-    for cell in range(side * side):
-        pixel = points[cell // side, cell % side] - first
-        if pixel < 0 or pixel >= depth.size or not _is_beside_empty(points, cell // side, cell % side):
-            continue
-        i, j = pixel // columns, pixel % columns
-        distance, u, v = np.float64(depth[i, j]), us[i, j], vs[i, j]
-        ray_z = rays[2, 0] * u + (rays[2, 1] * v + rays[2, 2])
-        if not ray_z < 0.0:
-            continue
-        ray_row = rays[0, 0] * u + (rays[0, 1] * v + rays[0, 2])
-        ray_column = rays[1, 0] * u + (rays[1, 1] * v + rays[1, 2])
-        row, column = origin[0] + distance * ray_row, origin[1] + distance * ray_column
-        # derivatives of the point by u and v on the plane of its height
-        slope_u, slope_v = rays[2, 0] / ray_z, rays[2, 1] / ray_z
-        row_u, row_v = distance * (rays[0, 0] - ray_row * slope_u), distance * (rays[0, 1] - ray_row * slope_v)
-        column_u = distance * (rays[1, 0] - ray_column * slope_u)
-        column_v = distance * (rays[1, 1] - ray_column * slope_v)
-        area = abs(row_u * column_v - row_v * column_u)
-        reach_row = min(0.5 * (abs(row_u) + abs(row_v)), REACH)
-        reach_column = min(0.5 * (abs(column_u) + abs(column_v)), REACH)
-        z = np.float32(origin[2] + distance * ray_z)
-        first_column = max(0, int(np.ceil(column - reach_column - 0.5)))
-        last_column = min(side, int(column + reach_column + 0.5))
-        for r in range(max(0, int(np.ceil(row - reach_row - 0.5))), min(side, int(row + reach_row + 0.5))):
-            for c in range(first_column, last_column):
-                if points[r, c] >= 0:
-                    continue
-                other = source[r, c]
-                if other >= 0 and (z < height[r, c] or (z == height[r, c] and first + pixel > other)):
-                    continue
-                down, right = r + 0.5 - row, c + 0.5 - column
-                covers_v = 2.0 * abs(down * column_v - right * row_v) <= area
-                if covers_v and 2.0 * abs(right * row_u - down * column_u) <= area:
-                    height[r, c], source[r, c] = z, first + pixel
+    for own_row in range(side):
+        for own_column in range(side):
+            pixel = points[own_row, own_column] - first
+            if pixel < 0 or pixel >= depth.size or not _is_beside_empty(points, own_row, own_column):
+                continue
+            i, j = pixel // columns, pixel % columns
+            distance, u, v = np.float64(depth[i, j]), us[i, j], vs[i, j]
+            ray_z = rays[2, 0] * u + (rays[2, 1] * v + rays[2, 2])
+            if not ray_z < 0.0:
+                continue
+            ray_row = rays[0, 0] * u + (rays[0, 1] * v + rays[0, 2])
+            ray_column = rays[1, 0] * u + (rays[1, 1] * v + rays[1, 2])
+            row, column = origin[0] + distance * ray_row, origin[1] + distance * ray_column
+            # derivatives of the point by u and v on the plane of its height
+            slope_u, slope_v = rays[2, 0] / ray_z, rays[2, 1] / ray_z
+            row_u, row_v = distance * (rays[0, 0] - ray_row * slope_u), distance * (rays[0, 1] - ray_row * slope_v)
+            column_u = distance * (rays[1, 0] - ray_column * slope_u)
+            column_v = distance * (rays[1, 1] - ray_column * slope_v)
+            # The footprint is where |down column_v - right row_v| and |right row_u - down column_u| are at most half of
+            # its area: in every row, the cells in both of two intervals.
+            half_area = 0.5 * abs(row_u * column_v - row_v * column_u)
+            row_u, row_v = _away_from_zero(row_u), _away_from_zero(row_v)
+            skew_u, skew_v = column_u / row_u, column_v / row_v
+            half_u, half_v = half_area / abs(row_u), half_area / abs(row_v)
+            reach = min(0.5 * (abs(row_u) + abs(row_v)), REACH)
+            z = np.float32(origin[2] + distance * ray_z)
+            for r in range(max(0, int(np.ceil(row - reach - 0.5))), min(side, int(row + reach + 0.5))):
+                down = r + 0.5 - row
+                left = max(down * skew_u - half_u, down * skew_v - half_v, -REACH)
+                right = min(down * skew_u + half_u, down * skew_v + half_v, REACH)
+                for c in range(
+                    max(0, int(np.ceil(column + left - 0.5))), min(side, int(np.floor(column + right + 0.5)))
+                ):
+                    if points[r, c] >= 0:
+                        continue
+                    other = source[r, c]
+                    if other < 0 or z > height[r, c] or (z == height[r, c] and first + pixel < other):
+                        height[r, c], source[r, c] = z, first + pixel
+
+
+@njit(cache=True, nogil=True)
+def _away_from_zero(value):  # type: ignore[no-untyped-def]
+    """The value, or a tiny one for zero: an interval is infinite then."""
+    return value if abs(value) > 1e-9 else 1e-9
