@@ -14,6 +14,7 @@ from draccus.utils import DecodingError
 
 from lerobot_symview.errors import OptionError
 from lerobot_symview.views import View, ViewSpec, make_views
+from lerobot_symview.views.base import CameraNames, checked_cameras
 
 
 def _decode(raw: Any, path: Sequence[str]) -> ViewSpec:
@@ -25,6 +26,8 @@ def _decode(raw: Any, path: Sequence[str]) -> ViewSpec:
 
 draccus.decode.register(ViewSpec, _decode)
 draccus.encode.register(ViewSpec, lambda spec, *_: spec.plain())
+draccus.decode.register(CameraNames, lambda raw, *_: checked_cameras(raw))
+draccus.encode.register(CameraNames, lambda names, *_: list(names))
 
 
 def views_from_flags(specs: Iterable[ViewSpec], size: int | None, dotted: Mapping[str, View]) -> dict[str, View]:

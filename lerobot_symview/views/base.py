@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
@@ -100,7 +100,7 @@ class View(ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     size: int  # rows and columns of every output
-    cameras: tuple[str, ...] = ()  # cameras whose images the view merges with its own camera's
+    cameras: Sequence[str] = ()  # cameras whose images the view merges with its own camera's
     memory: bool = False  # whether an image depends on the earlier frames of the episode
 
     @property
@@ -273,15 +273,23 @@ def check_size(size: int) -> None:
         raise OptionError(f"a view's size must be an integer from {SMALLEST} to {LARGEST} pixels, got {size}")
 
 
-def checked_cameras(cameras: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the cameras that a view merges as a tuple.
+class CameraNames(tuple[str, ...]):
+    """Names of the cameras that a view merges. Command lines spell it as a name or a list, `left` or `[side, left]`."""
+
+
+NO_CAMERAS = CameraNames()
+
+
+def checked_cameras(cameras: str | Iterable[str]) -> CameraNames:
+    """Return the names of the cameras that a view merges.
 
     Raises:
         OptionError: if they are no names, or a name is given twice.
     """
-    if isinstance(cameras, str) or not all(isinstance(name, str) and name for name in cameras):
+    listed = [cameras] if isinstance(cameras, str) else list(cameras)
+    if not all(isinstance(name, str) and name for name in listed):
         raise OptionError(f"cameras must be a list of names, such as [side, left], got {cameras!r}")
-    names = tuple(cameras)
+    names = CameraNames(listed)
     if len(set(names)) < len(names):
         raise OptionError(f"cameras must differ, got {', '.join(names)}")
     return names

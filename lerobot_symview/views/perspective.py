@@ -14,7 +14,16 @@ from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.homography import inside_image, pixel_density, warp_map, warp_plane
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views.base import Frame, Kind, View, check_size, checked_cameras, gray_to_rgb
+from lerobot_symview.views.base import (
+    NO_CAMERAS,
+    CameraNames,
+    Frame,
+    Kind,
+    View,
+    check_size,
+    checked_cameras,
+    gray_to_rgb,
+)
 
 
 def warp_table(
@@ -47,7 +56,7 @@ def warp_table(
         rgb, camera = [rgb], [camera]  # type: ignore[list-item]
     frame, *others = [Frame(color, None, one, workspace) for color, one in zip(rgb, camera, strict=True)]
     further = {str(number): other for number, other in enumerate(others, start=2)}
-    view = PerspectiveView(size, plane_height, gripper=False, cameras=tuple(further))
+    view = PerspectiveView(size, plane_height, gripper=False, cameras=CameraNames(further))
     return view.render(replace(frame, others=further))["persp"]
 
 
@@ -62,7 +71,7 @@ class PerspectiveView(View):
     gripper: bool = True
     """Add `persp_gripper` if the gripper's state is known: the fingers as squares whose brightness is the gripper's
     height."""
-    cameras: tuple[str, ...] = ()
+    cameras: CameraNames = NO_CAMERAS
     """Cameras whose images the view merges, such as `[side, left]`: each pixel shows the camera that has the most
     pixels of that part of the plane. The view's own camera is always one of them."""
 

@@ -16,7 +16,17 @@ from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Camera, aligned_depth
 from lerobot_symview.geometry.units import in_metres
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.views.base import Frame, Kind, View, ViewSpec, check_size, checked_cameras, gray_to_rgb
+from lerobot_symview.views.base import (
+    NO_CAMERAS,
+    CameraNames,
+    Frame,
+    Kind,
+    View,
+    ViewSpec,
+    check_size,
+    checked_cameras,
+    gray_to_rgb,
+)
 
 if TYPE_CHECKING:
     from lerobot_symview.geometry.memory import Memory
@@ -92,7 +102,7 @@ def reproject(
         for color, distance, one in zip(rgb, depth, camera, strict=True)
     ]
     further = {str(number): other for number, other in enumerate(others, start=2)}
-    view = ViewSpec("reproj", options | {"height": True, "mask": True, "cameras": tuple(further)}).make()
+    view = ViewSpec("reproj", options | {"height": True, "mask": True, "cameras": [*further]}).make()
     images = view.render(replace(frame, others=further))
     return Reprojection(images["reproj"], images["reproj_height"], images["reproj_seen"][..., 0] > 0)
 
@@ -125,7 +135,7 @@ class ReprojectedView(View):
     """Add `reproj_height`: metres above the table, one channel, which LeRobot's own policies do not accept."""
     mask: bool = False
     """Add `reproj_seen`: white where the camera measured a point, black where the image is infilled."""
-    cameras: tuple[str, ...] = ()
+    cameras: CameraNames = NO_CAMERAS
     """Cameras whose images the view merges, such as `[side, left]`: each cell shows its highest surface, by the camera
     that has the most pixels of it. The view's own camera is always one of them."""
     memory: bool = False

@@ -5,10 +5,12 @@ import shutil
 import sys
 from dataclasses import replace
 
+import draccus
 import numpy as np
 import pytest
 import torch
 import yaml
+from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, modify_features
 from lerobot.envs.utils import preprocess_observation
@@ -255,9 +257,9 @@ def test_lerobot_trains_and_evaluates_a_policy_on_a_merged_view(two_cameras, mer
 
 @pytest.mark.parametrize(
     ("cameras", "message"),
-    [("side", "must be a list of names"), (["a", "a"], "must differ, got a, a"), ([3], "must be a list of names")],
+    [("", "must be a list of names"), (["a", "a"], "must differ, got a, a"), ([3], "must be a list of names")],
 )
-def test_wrong_names_raise(cameras, message):
+def test_wrong_camera_names_raise(cameras, message):
     with pytest.raises(OptionError, match=message):
         make_view("reproj", cameras=cameras)
 
@@ -278,3 +280,13 @@ def test_reinforcement_learning_needs_the_cameras_of_the_demonstrations(two_came
     with pytest.raises(ValueError, match=r"--env\.more_cameras: left\.azimuth_deg is 60\.0, the dataset has 90\.0"):
         check_scene(dataset, moved, "side", ["left"])
     check_scene(dataset, replace(env, more_cameras=(LEFT,)), "side", ["left"])
+
+
+@pytest.mark.parametrize(("spelled", "names"), [("left", ("left",)), ("[side, left]", ("side", "left")), ("[]", ())])
+def test_command_lines_name_one_camera_or_a_list(spelled, names):
+    flag = f"--env.reproj.cameras={spelled}"
+    more = "--env.more_cameras=[{name: left}]"
+    config = draccus.parse(EvalPipelineConfig, args=["--env.type=symview", more, flag, "--eval.n_episodes=1"])
+    assert config.env.reproj.cameras == names
+    assert make_view("reproj", cameras=spelled if spelled == "left" else list(names)).cameras == names
+    assert draccus.encode(config.env.reproj)["cameras"] == list(names)
