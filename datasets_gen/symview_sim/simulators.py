@@ -245,11 +245,12 @@ class _Reporter:
     def __call__(self, raw: RawObservation) -> Observation:
         """Return the features of an observation."""
         features, camera = named_features(raw), self._config.camera
-        others = {name: _frame(features, name, self._workspace) for name in other_cameras(self._views, camera)}
-        for render in self._renderers:
+        if self._renderers:
+            others = {name: _frame(features, name, self._workspace) for name in other_cameras(self._views, camera)}
             frame = replace(_frame(features, camera, self._workspace), others=others)
-            for output, image in render(frame).items():
-                features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
+            for render in self._renderers:
+                for output, image in render(frame).items():
+                    features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
         return {name: features[name] for name in self._config.names}
 
 

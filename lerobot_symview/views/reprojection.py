@@ -228,13 +228,12 @@ class ReprojectedView(View):
         seen = buffer.source != zbuffer.EMPTY
         if self.infill == "splat":
             buffer = splat.with_splats(buffer, depths, cameras, frame.workspace)
-        known = buffer.source != zbuffer.EMPTY
         colors_of = [source.rgb for source in sources]
         age = None
         if self.memory:
             buffer, age = recall(memory, buffer, depths, cameras, frame.workspace, frame.gripper)
             colors_of += [] if memory is None else [memory.rgb]
-            known = buffer.source != zbuffer.EMPTY
+        known = buffer.source != zbuffer.EMPTY
         is_nearest = self.infill in ("nearest", "occlusion", "splat")
         shown = infill.nearest_known(known) if is_nearest else _identity_cells(self.size)
         if self.infill in ("occlusion", "splat"):

@@ -113,8 +113,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         observation = self._depth.in_metres(self._own_names(observation))
         is_augmented = self.augmentation > 0 and self._is_training
         if is_augmented:
-            stored = [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
-            observation = {key: values for key, values in observation.items() if key not in stored}
+            observation = {key: values for key, values in observation.items() if key not in self._made}
         missing = {
             name: view
             for name, view in self._views.items()
@@ -157,23 +156,27 @@ class ViewsProcessorStep(ObservationProcessorStep):
         """Keep the declared features unchanged: the policy names what it needs."""
         return features
 
+    @property
+    def _made(self) -> list[str]:
+        """The features of the views."""
+        return [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
+
     def _own_names(self, observation: RobotObservation) -> RobotObservation:
         """Return the observation with the names of `camera`, where those of another camera were not all renamed."""
-        made = [keys.view(self.camera, output) for view in self._views.values() for output in view.outputs]
         source = [keys.rgb(self.camera)]
         if any(view.needs_depth for view in self._views.values()):
             source.append(keys.depth(self.camera))
         own = self._observed[self.camera]
         if own.fixed is None:
             source += own.matrices
-        others = keys.substitutes(observation, self.camera, made, source) if made else []
+        others = keys.substitutes(observation, self.camera, self._made, source) if self._made else []
         others = [name for name in others if name not in self._observed]
         if len(others) != 1:
             return observation
         if others[0] not in self._substitutes:
             self._substitutes.add(others[0])
             logger.info("the camera %r takes the place of %r", others[0], self.camera)
-        features = [keys.rgb(self.camera), keys.depth(self.camera), *keys.calibration(self.camera), *made]
+        features = [keys.rgb(self.camera), keys.depth(self.camera), *keys.calibration(self.camera), *self._made]
         return keys.as_camera(observation, self.camera, others[0], features)
 
     def _check(self, batches: dict[str, FrameBatch]) -> None:

@@ -5,49 +5,44 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_policy_symview.methods import METHODS
-from lerobot_symview.geometry.miscalibration import Miscalibration
-from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
-from lerobot_symview.views import ViewSpec
+from symview_eval.experiments.rows import (
+    ABLATION_TASKS,
+    BROKEN,
+    CLONED_TASKS,
+    CLOUD,
+    ELEVATIONS,
+    ORACLE,
+    ORACLE_RGB,
+    PERSP,
+    PLACEMENTS,
+    PLAIN,
+    PLAIN_RGB,
+    REPROJ,
+    SECOND_CAMERA,
+    SENSORS,
+    SIDE,
+    SIDE_RGB,
+    TRANSFERRED,
+    VOXEL,
+    WITH_ERRORS,
+    MethodRow,
+    at_elevation,
+    method_row,
+    seeing_more,
+    with_plane_height,
+    with_varying_camera,
+)
 from symview_eval.experiments.scale import Algorithm, Scale
 from symview_sim.tasks import TASK_NAMES
 
 HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps for SACfD
 RL_DEMONSTRATIONS, RL_DEMONSTRATIONS_HARDER = 20, 50
-
-
-@dataclass(frozen=True)
-class MethodRow:
-    """A method, one row of a table."""
-
-    name: str
-    """Name of its result folder."""
-    label: str
-    """Its name in the paper."""
-    policy: dict[str, Any] = field(hash=False)
-    """Policy settings: `method`, and overrides of that method's settings."""
-    camera: CameraSpec = field(default_factory=CameraSpec)
-    """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
-    more_cameras: tuple[CameraSpec, ...] = ()
-    """Further cameras, which the view merges."""
-
-    @property
-    def remembers(self) -> bool:
-        """Whether its view has memory, and must be added to the demonstrations before the training."""
-        return bool(self.policy.get("view_options", {}).get("memory"))
-
-    @property
-    def policy_options(self) -> dict[str, Any]:
-        """Constructor arguments of the policy's configuration: `view_options` are those of its method's view."""
-        options = {name: value for name, value in self.policy.items() if name != "view_options"}
-        if "view_options" in self.policy:
-            options["view"] = ViewSpec(METHODS[options["method"]]["view"], self.policy["view_options"])
-        return options
 
 
 @dataclass(frozen=True)
@@ -161,86 +156,6 @@ def _hash(settings: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _row(name: str, label: str, method: str | None = None, **policy: Any) -> MethodRow:
-    return MethodRow(name, label, {"method": method or name, **policy})
-
-
-def _rgb(method: str, label: str) -> MethodRow:
-    return _row(f"{method}_rgb", label, method, modality="rgb")
-
-
-ORACLE, ORACLE_RGB = _row("oracle_equi", "Oracle Equi"), _rgb("oracle_equi", "Oracle Equi")
-REPROJ, PERSP = _row("reproj_equi", "Reproj. Equi"), _row("persp_equi", "Persp. Equi")
-SIDE, SIDE_RGB = _row("sideview_equi", "Sideview Equi"), _rgb("sideview_equi", "Sideview Equi")
-PLAIN, PLAIN_RGB = _row("sideview_nonequi", "Sideview NonEqui"), _rgb("sideview_nonequi", "Sideview NonEqui")
-VOXEL, CLOUD = _row("voxel_equi", "Voxel Equi"), _row("point_cloud_equi", "Point Cloud Equi")
-
-BROKEN = _row("persp_equi_broken", "Persp. Equi (broken)")
-PLUCKER = _row("sideview_plucker", "Sideview Plücker")
-
-CLONED_TASKS = ("block_picking", "block_pushing", "drawer_opening", "block_stacking", "block_in_bowl")
-ABLATION_TASKS = ("drawer_opening", "block_stacking", "block_in_bowl")
-ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
-
-
-def _miscalibrated(**errors: float) -> CameraSpec:
-    return CameraSpec(miscalibration=Miscalibration(**errors))
-
-
-def _at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
-    camera = CameraSpec(elevation_deg=elevation_deg)
-    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
-
-
-TRANSFERRED = (REPROJ, PERSP, BROKEN, SIDE, PLAIN, PLUCKER, VOXEL, CLOUD)
-ANYWHERE = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0)
-PLACEMENTS = (
-    ("training", CameraSpec()),
-    *(
-        (f"azimuth {azimuth:+d}°", CameraSpec(azimuth_deg=azimuth))
-        for azimuth in (-135, -90, -45, -20, 20, 45, 90, 135)
-    ),
-    *((f"elevation {elevation}°", CameraSpec(elevation_deg=elevation)) for elevation in (15, 30, 60, 75)),
-    ("distance 1.1 m", CameraSpec(distance=1.1)),
-    ("field of view 60°", CameraSpec(fov_deg=60.0)),
-    ("new in every episode", CameraSpec(spread=ANYWHERE)),
-)
-
-
-AUGMENTED = _row("reproj_equi_augmented", "Reproj. Equi, camera augmentation", "reproj_equi", camera_augmentation=1.0)
-WITH_ERRORS = (REPROJ, AUGMENTED, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
-SENSORS = (
-    ("exact", CameraSpec()),
-    *((f"position {100 * metres:g} cm", _miscalibrated(position=metres)) for metres in (0.005, 0.01, 0.02, 0.03)),
-    *((f"rotation {degrees:g}°", _miscalibrated(rotation_deg=degrees)) for degrees in (0.5, 1.0, 2.0, 5.0)),
-    ("1 cm and 1°", _miscalibrated(position=0.01, rotation_deg=1.0)),
-    *((f"focal length {100 * error:g} %", _miscalibrated(focal=error)) for error in (0.01, 0.025, 0.05)),
-    *((f"depth noise {1000 * metres:g} mm", CameraSpec(depth_noise=metres)) for metres in (0.001, 0.0025, 0.005)),
-    *((f"depth dropout {100 * share:g} %", CameraSpec(depth_dropout=share)) for share in (0.01, 0.1)),
-    ("flying pixels 50 %", CameraSpec(flying_pixels=0.5)),
-    ("late by an action", CameraSpec(delay=1)),
-)
-
-
-SECOND_CAMERA = CameraSpec("left", azimuth_deg=90.0)
-
-
-def _seeing_more(name: str, label: str, *cameras: CameraSpec, arm: bool = True, memory: bool = False) -> MethodRow:
-    merged = {"cameras": [camera.name for camera in cameras]} if cameras else {}
-    options = merged | ({"memory": True} if memory else {})
-    policy = {"method": "reproj_equi", **({"view_options": options} if options else {})}
-    return MethodRow(f"reproj_equi_{name}", f"Reproj. Equi, {label}", policy, CameraSpec(sees_robot=arm), cameras)
-
-
-def _with_varying_camera(row: MethodRow) -> MethodRow:
-    camera = CameraSpec(spread=ANYWHERE)
-    return MethodRow(f"{row.name}_varying", f"{row.label}, trained with many cameras", row.policy, camera)
-
-
-def _with_plane_height(name: str, label: str, plane_height: float | str) -> MethodRow:
-    return _row(name, label, "persp_equi_broken", view_options={"plane_height": plane_height})
-
-
 EXPERIMENTS = {
     experiment.name: experiment
     for experiment in (
@@ -261,10 +176,10 @@ EXPERIMENTS = {
             "Relaxed and broken symmetry",
             (
                 REPROJ,
-                _row("reproj_equi_relaxed", "Reproj. Equi (relaxed)"),
-                _row("reproj_equi_broken", "Reproj. Equi (broken)"),
+                method_row("reproj_equi_relaxed", "Reproj. Equi (relaxed)"),
+                method_row("reproj_equi_broken", "Reproj. Equi (broken)"),
                 PERSP,
-                _row("persp_equi_relaxed", "Persp. Equi (relaxed)"),
+                method_row("persp_equi_relaxed", "Persp. Equi (relaxed)"),
                 BROKEN,
             ),
             ABLATION_TASKS,
@@ -275,20 +190,20 @@ EXPERIMENTS = {
             "Infill of the reprojected view",
             (
                 MethodRow(REPROJ.name, "Nearest Interpolation", REPROJ.policy),
-                _row(
+                method_row(
                     "reproj_equi_occlusion",
                     "Nearest, or behind the occluder",
                     "reproj_equi",
                     view_options={"infill": "occlusion"},
                 ),
-                _row(
+                method_row(
                     "reproj_equi_splat",
                     "Footprints of pixels, or behind the occluder",
                     "reproj_equi",
                     view_options={"infill": "splat"},
                 ),
-                _row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
-                _row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),
+                method_row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
+                method_row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),
             ),
             ABLATION_TASKS,
         ),
@@ -296,10 +211,10 @@ EXPERIMENTS = {
             "table5",
             "Plane height of the perspective view",
             (
-                _row("persp_equi_broken", "0.0 cm"),
-                _with_plane_height("persp_equi_broken_2.5cm", "2.5 cm", 0.025),
-                _with_plane_height("persp_equi_broken_5cm", "5.0 cm", 0.05),
-                _with_plane_height("persp_equi_broken_dynamic", "dynamic", "gripper"),
+                method_row("persp_equi_broken", "0.0 cm"),
+                with_plane_height("persp_equi_broken_2.5cm", "2.5 cm", 0.025),
+                with_plane_height("persp_equi_broken_5cm", "5.0 cm", 0.05),
+                with_plane_height("persp_equi_broken_dynamic", "dynamic", "gripper"),
             ),
             ABLATION_TASKS,
             (10,),
@@ -323,7 +238,7 @@ EXPERIMENTS = {
             "A camera that is moved after the training",
             (
                 *TRANSFERRED,
-                *(_with_varying_camera(row) for row in TRANSFERRED),
+                *(with_varying_camera(row) for row in TRANSFERRED),
             ),
             CLONED_TASKS,
             (10,),
@@ -343,10 +258,10 @@ EXPERIMENTS = {
             (
                 ORACLE,
                 REPROJ,
-                _seeing_more("memory", "memory", memory=True),
-                _seeing_more("two_cameras", "two cameras", SECOND_CAMERA),
-                _seeing_more("two_cameras_memory", "two cameras and memory", SECOND_CAMERA, memory=True),
-                _seeing_more("without_arm", "arm not drawn", arm=False),
+                seeing_more("memory", "memory", memory=True),
+                seeing_more("two_cameras", "two cameras", SECOND_CAMERA),
+                seeing_more("two_cameras_memory", "two cameras and memory", SECOND_CAMERA, memory=True),
+                seeing_more("without_arm", "arm not drawn", arm=False),
             ),
             CLONED_TASKS,
             (10,),
@@ -355,8 +270,8 @@ EXPERIMENTS = {
             "figure7",
             "Elevation of the camera",
             (
-                *(_at_elevation(row, elevation) for row in (REPROJ, SIDE, PLAIN) for elevation in ELEVATIONS),
-                *(_at_elevation(row, elevation) for row in (PERSP, SIDE_RGB, PLAIN_RGB) for elevation in ELEVATIONS),
+                *(at_elevation(row, elevation) for row in (REPROJ, SIDE, PLAIN) for elevation in ELEVATIONS),
+                *(at_elevation(row, elevation) for row in (PERSP, SIDE_RGB, PLAIN_RGB) for elevation in ELEVATIONS),
                 ORACLE,
                 ORACLE_RGB,
             ),

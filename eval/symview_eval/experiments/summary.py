@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from symview_eval.experiments.grid import Experiment, MethodRow, select
+from symview_eval.experiments.grid import Experiment, select
 from symview_eval.experiments.results import Checkpoint, Result, read_result
+from symview_eval.experiments.rows import MethodRow
 from symview_eval.experiments.scale import SCALES
 from symview_eval.statistics import SuccessRate
 

@@ -1,0 +1,127 @@
+"""Rows of the tables: methods and the cameras of their demonstrations. Cameras of evaluations after the training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot_policy_symview.methods import METHODS
+from lerobot_symview.geometry.miscalibration import Miscalibration
+from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.views import ViewSpec
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """A method, one row of a table."""
+
+    name: str
+    """Name of its result folder."""
+    label: str
+    """Its name in the paper."""
+    policy: dict[str, Any] = field(hash=False)
+    """Policy settings: `method`, and overrides of that method's settings."""
+    camera: CameraSpec = field(default_factory=CameraSpec)
+    """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
+    more_cameras: tuple[CameraSpec, ...] = ()
+    """Further cameras, which the view merges."""
+
+    @property
+    def remembers(self) -> bool:
+        """Whether its view has memory, and must be added to the demonstrations before the training."""
+        return bool(self.policy.get("view_options", {}).get("memory"))
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Constructor arguments of the policy's configuration: `view_options` are those of its method's view."""
+        options = {name: value for name, value in self.policy.items() if name != "view_options"}
+        if "view_options" in self.policy:
+            options["view"] = ViewSpec(METHODS[options["method"]]["view"], self.policy["view_options"])
+        return options
+
+
+def method_row(name: str, label: str, method: str | None = None, **policy: Any) -> MethodRow:
+    """Return the row of a method, by default that of its name, with overrides of the method's settings."""
+    return MethodRow(name, label, {"method": method or name, **policy})
+
+
+def _rgb(method: str, label: str) -> MethodRow:
+    return method_row(f"{method}_rgb", label, method, modality="rgb")
+
+
+ORACLE, ORACLE_RGB = method_row("oracle_equi", "Oracle Equi"), _rgb("oracle_equi", "Oracle Equi")
+REPROJ, PERSP = method_row("reproj_equi", "Reproj. Equi"), method_row("persp_equi", "Persp. Equi")
+SIDE, SIDE_RGB = method_row("sideview_equi", "Sideview Equi"), _rgb("sideview_equi", "Sideview Equi")
+PLAIN, PLAIN_RGB = method_row("sideview_nonequi", "Sideview NonEqui"), _rgb("sideview_nonequi", "Sideview NonEqui")
+VOXEL, CLOUD = method_row("voxel_equi", "Voxel Equi"), method_row("point_cloud_equi", "Point Cloud Equi")
+
+BROKEN = method_row("persp_equi_broken", "Persp. Equi (broken)")
+PLUCKER = method_row("sideview_plucker", "Sideview Plücker")
+
+CLONED_TASKS = ("block_picking", "block_pushing", "drawer_opening", "block_stacking", "block_in_bowl")
+ABLATION_TASKS = ("drawer_opening", "block_stacking", "block_in_bowl")
+ELEVATIONS = (15.0, 30.0, 45.0, 60.0, 75.0)
+
+
+def _miscalibrated(**errors: float) -> CameraSpec:
+    return CameraSpec(miscalibration=Miscalibration(**errors))
+
+
+def at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
+    """Return the row with demonstrations by a camera at an elevation."""
+    camera = CameraSpec(elevation_deg=elevation_deg)
+    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
+
+
+TRANSFERRED = (REPROJ, PERSP, BROKEN, SIDE, PLAIN, PLUCKER, VOXEL, CLOUD)
+ANYWHERE = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0)
+PLACEMENTS = (
+    ("training", CameraSpec()),
+    *(
+        (f"azimuth {azimuth:+d}°", CameraSpec(azimuth_deg=azimuth))
+        for azimuth in (-135, -90, -45, -20, 20, 45, 90, 135)
+    ),
+    *((f"elevation {elevation}°", CameraSpec(elevation_deg=elevation)) for elevation in (15, 30, 60, 75)),
+    ("distance 1.1 m", CameraSpec(distance=1.1)),
+    ("field of view 60°", CameraSpec(fov_deg=60.0)),
+    ("new in every episode", CameraSpec(spread=ANYWHERE)),
+)
+
+
+AUGMENTED = method_row(
+    "reproj_equi_augmented", "Reproj. Equi, camera augmentation", "reproj_equi", camera_augmentation=1.0
+)
+WITH_ERRORS = (REPROJ, AUGMENTED, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
+SENSORS = (
+    ("exact", CameraSpec()),
+    *((f"position {100 * metres:g} cm", _miscalibrated(position=metres)) for metres in (0.005, 0.01, 0.02, 0.03)),
+    *((f"rotation {degrees:g}°", _miscalibrated(rotation_deg=degrees)) for degrees in (0.5, 1.0, 2.0, 5.0)),
+    ("1 cm and 1°", _miscalibrated(position=0.01, rotation_deg=1.0)),
+    *((f"focal length {100 * error:g} %", _miscalibrated(focal=error)) for error in (0.01, 0.025, 0.05)),
+    *((f"depth noise {1000 * metres:g} mm", CameraSpec(depth_noise=metres)) for metres in (0.001, 0.0025, 0.005)),
+    *((f"depth dropout {100 * share:g} %", CameraSpec(depth_dropout=share)) for share in (0.01, 0.1)),
+    ("flying pixels 50 %", CameraSpec(flying_pixels=0.5)),
+    ("late by an action", CameraSpec(delay=1)),
+)
+
+
+SECOND_CAMERA = CameraSpec("left", azimuth_deg=90.0)
+
+
+def seeing_more(name: str, label: str, *cameras: CameraSpec, arm: bool = True, memory: bool = False) -> MethodRow:
+    """Return reproj_equi with further cameras, without the arm in its images, or with memory."""
+    merged = {"cameras": [camera.name for camera in cameras]} if cameras else {}
+    options = merged | ({"memory": True} if memory else {})
+    policy = {"method": "reproj_equi", **({"view_options": options} if options else {})}
+    return MethodRow(f"reproj_equi_{name}", f"Reproj. Equi, {label}", policy, CameraSpec(sees_robot=arm), cameras)
+
+
+def with_varying_camera(row: MethodRow) -> MethodRow:
+    """Return the row with demonstrations by a new camera in every episode."""
+    camera = CameraSpec(spread=ANYWHERE)
+    return MethodRow(f"{row.name}_varying", f"{row.label}, trained with many cameras", row.policy, camera)
+
+
+def with_plane_height(name: str, label: str, plane_height: float | str) -> MethodRow:
+    """Return persp_equi_broken with another height of the warped plane."""
+    return method_row(name, label, "persp_equi_broken", view_options={"plane_height": plane_height})
