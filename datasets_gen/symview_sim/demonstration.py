@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.runtime.cli import CommandError
-from symview_sim.env import SymviewEnv, named_features
-from symview_sim.settings import EnvSettings
+from symview_sim.camera_rig import named_features
+from symview_sim.settings import WorldSettings
+from symview_sim.table_env import TableEnv
 
 ATTEMPTS = 10
 SEEDS_PER_EPISODE, SEEDS_PER_RECORDING = 100, 10**9
@@ -28,7 +29,7 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     return SEEDS_PER_RECORDING * (seed + 1) + SEEDS_PER_EPISODE * episode + attempt
 
 
-def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) -> tuple[EpisodeFrames, int]:
+def demonstrate(settings: WorldSettings, seed: int, episode: int, noise: float) -> tuple[EpisodeFrames, int]:
     """Return a successful episode and the number of attempts. The result depends on the arguments alone.
 
     Args:
@@ -51,15 +52,16 @@ def demonstrate(settings: EnvSettings, seed: int, episode: int, noise: float) ->
 
 
 @lru_cache(maxsize=1)
-def _environment(settings: EnvSettings) -> SymviewEnv:
+def _environment(settings: WorldSettings) -> TableEnv:
     return settings.make()
 
 
-def _attempt(env: SymviewEnv, seed: int, noise: float) -> list[dict[str, NDArray[Any]]] | None:
+def _attempt(env: TableEnv, seed: int, noise: float) -> list[dict[str, NDArray[Any]]] | None:
     """Return an episode's frames, or None if the expert fails."""
     observation, _ = env.reset(seed=seed)
     noise_rng = np.random.default_rng(seed)
-    largest = np.append(env.action_space.high[:4], 0.0)  # type: ignore[attr-defined]  # the aperture has no noise
+    has_noise = [name != "aperture" for name in env.settings.action_names]
+    largest = np.where(has_noise, env.action_space.high.astype(np.float64), 0.0)  # type: ignore[attr-defined]
     frames = []
     done = False
     while not done:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import draccus
 import numpy as np
 from tqdm import tqdm
 
@@ -19,7 +22,6 @@ from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import run_command
 from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.staging import is_complete, new_result, partial_folder
-from symview_sim.env import SymviewEnv
 from symview_sim.recording import (
     MAX_VIDEO_DEPTH,
     Recording,
@@ -28,7 +30,10 @@ from symview_sim.recording import (
     recorded_attempts,
     write_shard,
 )
-from symview_sim.settings import EnvSettings, NewDataset
+from symview_sim.settings import EnvSettings, NewDataset, WorldSettings
+from symview_sim.table_env import TableEnv
+from symview_sim.worlds.fetch import FetchSettings
+from symview_sim.worlds.metaworld import MetaWorldSettings
 
 logger = logging.getLogger(__name__)
 
@@ -37,15 +42,38 @@ EXAMPLES = """\
   symview-generate --env.task=drawer_opening --num_episodes=20 --num_workers=2 --root=data/drawer
   symview-generate --root=data/anywhere --env.camera.spread.azimuth_deg=180 --env.camera.spread.elevation_deg=20
   symview-generate --dataset.repo_id=me/picking --dataset.push_to_hub=true --dataset.private=true
+  symview-generate --root=data/push --env.type=metaworld --env.task=push-v3 --num_episodes=25
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
 
+class RecordedWorld(draccus.ChoiceRegistry, WorldSettings):
+    """The environment of a recording; `--env.type` selects its simulator."""
+
+    @classmethod
+    def default_choice_name(cls) -> str:
+        """Return the simulator that is used without `--env.type`."""
+        return "symview"
+
+
+@RecordedWorld.register_subclass("symview")
 @dataclass(unsafe_hash=True)
-class RecordedEnv(EnvSettings):
-    """The environment settings of a recording. The oracle is recorded by default."""
+class RecordedEnv(EnvSettings, RecordedWorld):
+    """The environment settings of a recording in PyBullet. The oracle is recorded by default."""
 
     oracle: bool = True
     """Add the camera `top`, which looks straight down and does not see the arm."""
+
+
+@RecordedWorld.register_subclass("metaworld")
+@dataclass(unsafe_hash=True)
+class RecordedMetaWorld(MetaWorldSettings, RecordedWorld):
+    """The environment settings of a recording in Meta-World."""
+
+
+@RecordedWorld.register_subclass("fetch")
+@dataclass(unsafe_hash=True)
+class RecordedFetch(FetchSettings, RecordedWorld):
+    """The environment settings of a recording of FetchPush."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +82,8 @@ class GenerateConfig:
 
     dataset: NewDataset = field(default_factory=NewDataset)
     """Location of the new dataset; `--root` is short for `--dataset.root`."""
-    env: RecordedEnv = field(default_factory=RecordedEnv)
-    """Task, robot arm, workspace and cameras."""
+    env: RecordedWorld = field(default_factory=RecordedEnv)
+    """Simulator (`--env.type`: `symview`, `metaworld` or `fetch`), task, workspace and cameras."""
     num_episodes: int = 50
     """Number of successful demonstrations."""
     seed: int = 0
@@ -128,13 +156,13 @@ def plan_recording(config: GenerateConfig, target: Path) -> Recording:
     """
     env = config.env.make()
     if config.video:
-        _check_video_depth(env, config.env.oracle)
+        _check_video_depth(env)
     recording = Recording(
         folder=partial_folder(target),
         repo_id=config.dataset.repo_id,
         env=config.env,
         instruction=env.task_description,
-        fps=env.metadata["render_fps"],
+        fps=config.env.actions_per_second,
         features=_features(env, config),
         seed=config.seed,
         noise=config.noise,
@@ -145,11 +173,13 @@ def plan_recording(config: GenerateConfig, target: Path) -> Recording:
     return recording
 
 
-def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:
+def _check_video_depth(env: TableEnv) -> None:
     """Raise a ValueError if a part of the workspace may be farther from a camera than the largest depth of a video."""
     half, height = env.workspace.size / 2, env.workspace.height_limit
     corners = np.concatenate([env.workspace.corners(), env.workspace.corners(height)])
-    for spec in env.specs[: -1 if oracle else None]:
+    for spec in env.specs:
+        if spec.name == keys.ORACLE:
+            continue
         if spec.varies:  # an upper bound over all random poses
             farthest = spec.distance + spec.spread.distance + 2 * spec.spread.target
             farthest += float(np.linalg.norm(spec.target) + np.linalg.norm([half, half, height]))
@@ -162,22 +192,26 @@ def _check_video_depth(env: SymviewEnv, oracle: bool) -> None:
             )
 
 
-def _features(env: SymviewEnv, config: GenerateConfig) -> Features:
+def _features(env: TableEnv, config: GenerateConfig) -> Features:
     features: Features = {
-        keys.STATE: {"dtype": "float32", "shape": (len(keys.STATE_NAMES),), "names": keys.STATE_NAMES},
-        keys.ACTION: {"dtype": "float32", "shape": (len(keys.ACTION_NAMES),), "names": keys.ACTION_NAMES},
+        keys.STATE: _vector(config.env.state_names),
+        keys.ACTION: _vector(config.env.action_names),
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
     }
     for spec in env.specs:
-        shown = {"depth": config.env.depth, "segmentation": config.env.segmentation}
+        shown = {"depth": config.env.depth, "segmentation": config.env.has_labels}
         features |= camera_features(spec.name, spec.height, spec.width, env.workspace, **shown)
     if config.video:
         for key, feature in features.items():
-            if feature["dtype"] == "image" and not (config.env.oracle and key == keys.depth("top")):
+            if feature["dtype"] == "image" and key != keys.depth(keys.ORACLE):
                 feature["dtype"] = "video"
     return features
+
+
+def _vector(names: Sequence[str]) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
 
 
 def main() -> None:

@@ -29,7 +29,7 @@ from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.metadata import RECORDING
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of, plain
 from symview_sim.demonstration import EpisodeFrames, demonstrate
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import WorldSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
 ATTEMPTS_KEY = "attempts"
@@ -46,7 +46,7 @@ class Recording:
     folder: Path
     """`<target>.partial`."""
     repo_id: str
-    env: EnvSettings
+    env: WorldSettings
     instruction: str
     fps: int
     features: Features
@@ -72,7 +72,8 @@ class Recording:
         """Return everything that determines the data, as JSON values."""
         content = asdict(self)
         del content["folder"]
-        versions = {"symview": version("lerobot_policy_symview"), "pybullet": version("pybullet")}
+        versions = {"symview": version("lerobot_policy_symview")}
+        versions |= {package: version(package) for package in self.env.packages}
         return plain(content | versions)
 
 

@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import Array, Camera, invert_rigid
 from symview_sim.bullet import camera_image, pybullet
+from symview_sim.camera_rig import CameraImages
 
 NEAR, FAR = 0.05, 4.0  # metres, clipping planes
 SCENE, SCENE_RADIUS = np.array([0.45, 0.0, 0.0]), 1.5  # metres: objects and arm lie within
 TILE = 0.1  # metres, side of the table's squares
 TILE_COLORS = np.array([[206, 200, 190], [188, 182, 172]], dtype=np.uint8)
 SKY = np.array([235, 240, 245], dtype=np.uint8)
-
-
-class CameraImages(NamedTuple):
-    """What one camera sees.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float32, metres along the optical axis, 0 above the horizon.
-        labels: (H, W) uint8, 0 where the table or nothing is seen, else the body's place in the order of loading; None
-            unless they were asked for.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    labels: NDArray[np.uint8] | None
 
 
 def render(client: Any, camera: Camera, labelled: bool = False) -> CameraImages:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
+from lerobot_symview import keys
 from lerobot_symview.datasets.hub import HubOptions
 from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.placement import CameraSpec, top_camera
@@ -13,57 +17,48 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import DatasetLocation
 from symview_sim.robots import ROBOTS
-from symview_sim.tasks import check_task
+from symview_sim.tasks import TASK_NAMES, check_task
 
 if TYPE_CHECKING:
     from symview_sim.env import SymviewEnv
+    from symview_sim.table_env import TableEnv
 
 
-# Not frozen, because the plugin's environment configuration derives from this class and from LeRobot's EnvConfig, which
-# is not frozen, and Python forbids mixing the two. Do not change an instance: a worker process looks up its environment
-# by the hash of the settings.
+# Not frozen, because the plugin's environment configurations derive from these classes and from LeRobot's EnvConfig,
+# which is not frozen, and Python forbids mixing the two. Do not change an instance: a worker process looks up its
+# environment by the hash of the settings.
 @dataclass(unsafe_hash=True)
-class EnvSettings:
-    """A task, a robot arm, the workspace and the cameras of an environment.
+class WorldSettings(ABC):
+    """A task of a simulator, the workspace and the cameras: what the environments of every simulator have in common.
 
     Raises:
-        OptionError: if the task or robot is unknown, two cameras have the same name, a camera is named like depth or
-            a view of another one, or a number is out of range.
+        OptionError: if two cameras have the same name, a camera is named like depth or a view of another one, or a
+            number is out of range.
     """
 
-    task: str = "block_picking"
-    """The task, such as `block_picking`."""
-    robot: str = "panda"
-    """The robot arm, `panda` or `kuka`."""
+    task: str = ""
+    """The task."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """The first camera: pose, image size and depth sensor."""
     more_cameras: tuple[CameraSpec, ...] = ()
     """Further cameras, such as `[{name: left, azimuth_deg: 90}]`."""
-    oracle: bool = False
-    """Add the camera `top`, which looks straight down and does not see the arm."""
     depth: bool = True
     """Add each camera's depth image, in metres."""
-    segmentation: bool = False
-    """Add each camera's segmentation: 0 table, 1 robot, 2 and up the objects."""
     workspace: Workspace = field(default_factory=Workspace)
     """The working area on the table."""
-    start_jitter: float = 0.0
-    """Largest random displacement of the gripper's start position per axis, metres."""
     max_steps: int = 50
     """Actions per episode."""
+
+    state_names: ClassVar[Sequence[str]] = keys.STATE_NAMES
+    action_names: ClassVar[Sequence[str]] = keys.ACTION_NAMES
+    packages: ClassVar[tuple[str, ...]] = ()
+    """Distributions whose versions determine what is recorded."""
 
     def __post_init__(self) -> None:
         self.check()
 
     def check(self) -> None:
         """Raise an OptionError unless the settings describe an environment."""
-        try:
-            check_task(self.task)
-            lookup("robot", self.robot, ROBOTS)
-        except ValueError as error:
-            raise OptionError(str(error)) from None
-        if not 0 <= self.start_jitter < math.inf:
-            raise OptionError(f"start_jitter must not be negative, got {self.start_jitter}")
         if self.max_steps < 1:
             raise OptionError(f"max_steps must be at least 1, got {self.max_steps}")
         names = [spec.name for spec in self.all_cameras]
@@ -76,24 +71,103 @@ class EnvSettings:
 
     @property
     def all_cameras(self) -> tuple[CameraSpec, ...]:
-        """The first camera, the further ones and, with `oracle`, the camera `top`."""
-        oracle = (top_camera(self.camera.height, self.workspace),) if self.oracle else ()
-        return (self.camera, *self.more_cameras, *oracle)
+        """The first camera and the further ones."""
+        return (self.camera, *self.more_cameras)
 
-    def make(self) -> SymviewEnv:
-        """Return a new environment. PyBullet is imported only now.
+    @classmethod
+    @abstractmethod
+    def task_names(cls) -> Sequence[str]:
+        """Return the names of the simulator's tasks."""
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether each camera has segmentation labels."""
+        return False
+
+    @property
+    @abstractmethod
+    def actions_per_second(self) -> int:
+        """Actions per second of the simulated robot."""
+
+    @abstractmethod
+    def make(self) -> TableEnv:
+        """Return a new environment. The simulator is imported only now.
 
         Raises:
-            ModuleNotFoundError: if PyBullet is not installed; the message names the extra.
+            ModuleNotFoundError: if the simulator is not installed; the message names the extra.
         """
+
+
+@contextmanager
+def needs_extra(module: str, extra: str, subject: str) -> Iterator[None]:
+    """Name the extra to install where an import of `module` fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        raise ModuleNotFoundError(
+            f"{subject} need {module}: pip install 'lerobot_policy_symview[{extra}]'", name=module
+        ) from None
+
+
+@dataclass(unsafe_hash=True)
+class EnvSettings(WorldSettings):
+    """A task, a robot arm, the workspace and the cameras of a PyBullet environment.
+
+    Raises:
+        OptionError: as `WorldSettings`, or if the task or robot is unknown.
+    """
+
+    task: str = "block_picking"
+    """The task, such as `block_picking`."""
+    robot: str = "panda"
+    """The robot arm, `panda` or `kuka`."""
+    oracle: bool = False
+    """Add the camera `top`, which looks straight down and does not see the arm."""
+    segmentation: bool = False
+    """Add each camera's segmentation: 0 table, 1 robot, 2 and up the objects."""
+    start_jitter: float = 0.0
+    """Largest random displacement of the gripper's start position per axis, metres."""
+
+    packages: ClassVar[tuple[str, ...]] = ("pybullet",)
+
+    def check(self) -> None:
+        """Raise an OptionError unless the settings describe an environment."""
         try:
+            check_task(self.task)
+            lookup("robot", self.robot, ROBOTS)
+        except ValueError as error:
+            raise OptionError(str(error)) from None
+        if not 0 <= self.start_jitter < math.inf:
+            raise OptionError(f"start_jitter must not be negative, got {self.start_jitter}")
+        super().check()
+
+    @classmethod
+    def task_names(cls) -> Sequence[str]:
+        """Return the names of the built-in tasks."""
+        return TASK_NAMES
+
+    @property
+    def all_cameras(self) -> tuple[CameraSpec, ...]:
+        """The first camera, the further ones and, with `oracle`, the camera `top`."""
+        oracle = (top_camera(self.camera.height, self.workspace),) if self.oracle else ()
+        return (*super().all_cameras, *oracle)
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether each camera has segmentation labels."""
+        return self.segmentation
+
+    @property
+    def actions_per_second(self) -> int:
+        """Actions per second: the simulated robot's speed."""
+        return 4
+
+    def make(self) -> SymviewEnv:
+        """Return a new environment. PyBullet is imported only now."""
+        with needs_extra("pybullet", "sim", "the simulated tasks"):
             from symview_sim.env import SymviewEnv
-        except ModuleNotFoundError as error:
-            if error.name != "pybullet":
-                raise
-            raise ModuleNotFoundError(
-                "the simulated tasks need PyBullet: pip install 'lerobot_policy_symview[sim]'", name=error.name
-            ) from None
         return SymviewEnv(self)
 
 

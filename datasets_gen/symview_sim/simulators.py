@@ -25,12 +25,14 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.camera import stored_camera
+from lerobot_symview.geometry.gripper_state import gripper_columns, gripper_poses
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, ViewSpec, other_cameras
-from symview_sim.env import EnvObservation as RawObservation
-from symview_sim.env import SymviewEnv, checked_action, named_features
-from symview_sim.settings import EnvSettings
+from symview_sim.camera_rig import EnvObservation as RawObservation
+from symview_sim.camera_rig import named_features
+from symview_sim.settings import WorldSettings
+from symview_sim.table_env import TableEnv, checked_action
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +44,7 @@ Observation = dict[str, NDArray[Any]]
 class SimulatorConfig:
     """The environment to simulate and the features to report."""
 
-    env: EnvSettings
+    env: WorldSettings
     """The environment."""
     names: tuple[str, ...]
     """Features to report."""
@@ -130,10 +132,11 @@ class Simulators:
         """Send a command to a simulator. Call `receive` before the next command.
 
         Raises:
-            ValueError: if a step's action is not five finite numbers. Raised here: in the simulator it would end it.
+            ValueError: if a step's action is not as many finite numbers as the environment takes. Raised here: in the
+                simulator it would end it.
         """
         if isinstance(command, Step):
-            checked_action(command.action)
+            checked_action(command.action, self._config.env.action_names)
         seed = command.seed if isinstance(command, Reset) else command.next_seed
         self._spare_seeds[index] = 0 if seed is None else seed
         with suppress(BrokenPipeError, ConnectionResetError):  # it died; `receive` handles this
@@ -210,7 +213,7 @@ def _simulate(connection: Connection, config: SimulatorConfig) -> None:
         connection.send(replace(outcome, seconds=time.perf_counter() - start))
 
 
-def _carry_out(command: Reset | Step, env: SymviewEnv, report: _Reporter) -> Outcome:
+def _carry_out(command: Reset | Step, env: TableEnv, report: _Reporter) -> Outcome:
     if isinstance(command, Reset):
         raw, _ = env.reset(seed=command.seed)
         report.start_episode()
@@ -246,17 +249,18 @@ class _Reporter:
         """Return the features of an observation."""
         features, camera = named_features(raw), self._config.camera
         if self._renderers:
-            others = {name: _frame(features, name, self._workspace) for name in other_cameras(self._views, camera)}
-            frame = replace(_frame(features, camera, self._workspace), others=others)
+            others = {name: self._frame(features, name) for name in other_cameras(self._views, camera)}
+            frame = replace(self._frame(features, camera), others=others)
             for render in self._renderers:
                 for output, image in render(frame).items():
                     features[keys.view(camera, output)] = image if image.ndim == 3 else image[..., None]
         return {name: features[name] for name in self._config.names}
 
-
-def _frame(features: Observation, camera: str, workspace: Workspace) -> Frame:
-    rgb, depth = features[keys.rgb(camera)], features.get(keys.depth(camera))
-    calibrated = stored_camera(
-        features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
-    )
-    return Frame(rgb, None if depth is None else depth[..., 0], calibrated, workspace, features[keys.STATE])
+    def _frame(self, features: Observation, camera: str) -> Frame:
+        rgb, depth = features[keys.rgb(camera)], features.get(keys.depth(camera))
+        calibrated = stored_camera(
+            features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
+        )
+        columns = gripper_columns(self._config.env.state_names)
+        gripper = None if columns is None else gripper_poses(features[keys.STATE], columns)
+        return Frame(rgb, None if depth is None else depth[..., 0], calibrated, self._workspace, gripper)

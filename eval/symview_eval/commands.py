@@ -9,13 +9,21 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
 
-EXTRAS = {"pybullet": "sim", "matplotlib": "viz", "rerun": "viz", "ray": "ray", "escnn": "escnn"}
+EXTRAS = {
+    "pybullet": "sim",
+    "metaworld": "metaworld",
+    "gymnasium_robotics": "fetch",
+    "matplotlib": "viz",
+    "rerun": "viz",
+    "ray": "ray",
+    "escnn": "escnn",
+}
 """Module -> the extra of this distribution that installs it."""
 
 
 def generate() -> None:
-    """Run `symview-generate`."""
-    _run("symview_sim.generate", ["pybullet"])
+    """Run `symview-generate`, which imports the simulator of `--env.type`."""
+    _run("symview_sim.generate", [])
 
 
 def train_rl() -> None:
@@ -46,7 +54,7 @@ def _run(module: str, needed: Sequence[str]) -> None:
         _end(missing)
     try:
         import_module(module).main()
-    except ModuleNotFoundError as error:  # for an option, such as --executor=ray
+    except ModuleNotFoundError as error:  # for an option, such as --executor=ray or --env.type=metaworld
         if error.name not in EXTRAS:
             raise
         _end([error.name])

@@ -38,6 +38,7 @@ from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
+from lerobot_symview.geometry.gripper_state import REQUIRED
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -275,7 +276,7 @@ def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, V
     logger.warning(
         "%s has no dimensions named %s: %s are rendered without clipping at the gripper and without a gripper image",
         keys.STATE,
-        ", ".join(keys.STATE_NAMES),
+        ", ".join(REQUIRED),
         ", ".join(using),
     )
     return {name: view.without_gripper() for name, view in views.items()}

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.errors import CalibrationError, DatasetError
+from lerobot_symview.geometry.gripper_state import gripper_columns
 from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.units import UNIT_NAMES
 from lerobot_symview.geometry.workspace import Workspace
@@ -142,9 +143,8 @@ def is_depth_feature(feature: dict[str, Any]) -> bool:
     return bool((feature.get("info") or {}).get("is_depth_map"))
 
 
-def gripper_dimensions(features: Features) -> list[int] | None:
-    """Return the indices of the gripper's x, y, z, yaw and aperture in the state; None if any is missing."""
-    names = features.get(keys.STATE, {}).get("names")
-    if not isinstance(names, list) or not set(keys.STATE_NAMES) <= set(names):
-        return None
-    return [names.index(name) for name in keys.STATE_NAMES]
+def gripper_dimensions(features: Features) -> list[int | None] | None:
+    """Return where the state has the gripper's pose, as `gripper_columns` does; None if it is unknown."""
+    state, action = (features.get(key, {}).get("names") for key in (keys.STATE, keys.ACTION))
+    turns = isinstance(action, list) and bool({"dyaw", "yaw"} & set(map(str, action)))
+    return gripper_columns(state, turns) if isinstance(state, list) else None

@@ -16,6 +16,7 @@ from lerobot_symview.datasets.features import check_depth_size, gripper_dimensio
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
+from lerobot_symview.geometry.gripper_state import gripper_poses
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, View, other_cameras
 
@@ -151,7 +152,9 @@ class FrameReader:
             depths = self.dataset.images(keys.depth(self.camera), episode, table, self.depth_unit)
         states: Iterator[Any] = repeat(None)
         if self.gripper:
-            states = iter(vectors(table, keys.STATE)[:, gripper_dimensions(self.dataset.features)])
+            pose = gripper_dimensions(self.dataset.features)
+            assert pose is not None
+            states = iter(gripper_poses(vectors(table, keys.STATE), pose))
         calibrations: Iterator[Any] = repeat(None)
         if self.given_camera is None:
             names = [keys.parameter(key) for key in self._calibration()]

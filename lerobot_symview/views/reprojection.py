@@ -124,6 +124,10 @@ class ReprojectedView(View):
     """Distance of the clipping height below the gripper's position, metres, since the fingers reach below it."""
     clip_floor: float = 0.06
     """Lowest clipping height, metres, so that an object at the gripper stays visible."""
+    clip_radius: float = 0.0
+    """Horizontal distance from the gripper within which clipping at the gripper removes points, metres; beyond it,
+    points above the working volume are removed. It keeps objects that are higher than the gripper. 0 clips everywhere.
+    """
     lowest: float = -0.05
     """Height, metres, below which points are removed: those of the floor beside a table."""
     flying_limit: float = 0.0
@@ -172,6 +176,10 @@ class ReprojectedView(View):
             raise OptionError(f"infill must be one of {', '.join(INFILLS)}, got {self.infill!r}")
         if self.clip not in ("gripper", "none") and (isinstance(self.clip, str) or not self.clip > -math.inf):
             raise OptionError(f"clip must be gripper, none or a height in metres, got {self.clip!r}")
+        if not 0 <= self.clip_radius < math.inf:
+            raise OptionError(f"clip_radius must be finite metres, at least 0, got {self.clip_radius}")
+        if self.clip_radius and self.clip != "gripper":
+            raise OptionError(f"clip_radius={self.clip_radius} needs clip=gripper, got {self.clip}")
         if not 0 <= self.flying_limit < math.inf:
             raise OptionError(f"flying_limit must be finite metres, at least 0, got {self.flying_limit}")
         lengths = {"clip_margin": self.clip_margin, "clip_floor": self.clip_floor, "lowest": self.lowest}
@@ -185,7 +193,7 @@ class ReprojectedView(View):
 
     def without_gripper(self) -> ReprojectedView:
         """Return the view without clipping at the gripper."""
-        return replace(self, clip="none") if self.uses_gripper else self
+        return replace(self, clip="none", clip_radius=0.0) if self.uses_gripper else self
 
     def with_mask(self) -> ReprojectedView:
         """Return the view with the output `reproj_seen`."""
@@ -212,15 +220,22 @@ class ReprojectedView(View):
 
     def _render(self, frame: Frame, memory: Memory | None) -> tuple[dict[str, NDArray], Memory | None]:
         """Return the outputs and, with the option, the memory of the episode after this frame."""
-        from lerobot_symview.geometry import fusion, infill, occlusion, splat, zbuffer  # slow import: numba
+        from lerobot_symview.geometry import arm, fusion, infill, occlusion, splat, zbuffer  # slow import: numba
         from lerobot_symview.geometry.memory import Memory, recall
 
         ceiling = self.ceiling(frame.gripper_height)
         sources = [self._source(one) for one in self.merged(frame)]
         depths, cameras = [source.depth for source in sources], [source.camera for source in sources]
+        shown_depths, highest = depths, ceiling
+        if self.clip_radius and frame.gripper is not None:
+            shown_depths = [
+                arm.without_arm(depth, camera, frame.workspace, frame.gripper, self.clip_radius, ceiling)
+                for depth, camera in zip(depths, cameras, strict=True)
+            ]
+            highest = np.inf
         buffers = [
-            zbuffer.zbuffer_from_depth(depth, camera, frame.workspace, self.size, ceiling, self.lowest)
-            for depth, camera in zip(depths, cameras, strict=True)
+            zbuffer.zbuffer_from_depth(depth, camera, frame.workspace, self.size, highest, self.lowest)
+            for depth, camera in zip(shown_depths, cameras, strict=True)
         ]
         buffer = buffers[0]
         if len(buffers) > 1:

@@ -79,10 +79,12 @@ class FrameBatch:
 def can_batch(view: View) -> bool:
     """Whether `render_batch` supports this view.
 
-    It does for infill `nearest` or `none` and `source_scale` 1, but not with memory, and for no third-party views.
+    It does for infill `nearest` or `none` and `source_scale` 1, but not with memory or a clip radius, and for no
+    third-party views.
     """
     if isinstance(view, ReprojectedView):
-        return view.infill in ("nearest", "none") and view.source_scale == 1 and not view.memory
+        is_simple = view.source_scale == 1 and not view.memory and not view.clip_radius
+        return view.infill in ("nearest", "none") and is_simple
     return isinstance(view, PerspectiveView)
 
 

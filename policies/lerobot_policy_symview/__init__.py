@@ -7,10 +7,18 @@ configurations and the processor steps; networks and the simulator are imported 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.encoders import register_encoder
-from lerobot_policy_symview.env_symview import SymviewEnvConfig
+from lerobot_policy_symview.env_symview import FetchEnvConfig, MetaWorldEnvConfig, SymviewEnvConfig
 from lerobot_policy_symview.processor_allowlist import restrict_processor_steps
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
 restrict_processor_steps()
 
-__all__ = ["SymviewBcConfig", "SymviewEnvConfig", "SymviewSacfdConfig", "ViewsProcessorStep", "register_encoder"]
+__all__ = [
+    "FetchEnvConfig",
+    "MetaWorldEnvConfig",
+    "SymviewBcConfig",
+    "SymviewEnvConfig",
+    "SymviewSacfdConfig",
+    "ViewsProcessorStep",
+    "register_encoder",
+]

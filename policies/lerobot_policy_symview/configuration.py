@@ -19,6 +19,7 @@ from lerobot_policy_symview.symmetry.groups import GROUP_NAMES
 from lerobot_policy_symview.symmetry.representations import ThetaRepresentation, VectorRepresentation
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
+from lerobot_symview.geometry.gripper_state import gripper_columns, missing_of
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
@@ -234,23 +235,33 @@ class SymviewConfig(PreTrainedConfig):
         return [ViewSpec(self.view.name, self.view.options | unused)]
 
     @property
-    def gripper_indices(self) -> list[int]:
-        """Indices of the gripper's x, y, z, yaw and aperture in the state; none if no view is made with them.
+    def gripper_indices(self) -> list[int | None]:
+        """Where the state has the gripper's pose, as `gripper_columns` says; none if no view is made with it.
 
         Raises:
-            ValueError: if the view is made with them and the state lacks some.
+            ValueError: if the view is made with it and the state lacks what is needed.
         """
         if not any(spec.make().uses_gripper for spec in self.views_to_make):
             return []
-        missing = [label for label in keys.STATE_NAMES if label not in self.state_symmetry]
-        if missing:
+        columns = gripper_columns(self.state_symmetry, self.gripper_turns)
+        if columns is None:
             raise ValueError(
-                f"--policy.view={self.view.name} uses the gripper's {', '.join(keys.STATE_NAMES)}; "
-                f"--policy.state_symmetry={self.state_symmetry} lacks {missing}: make the view without them, by "
+                f"--policy.view={self.view.name} uses the gripper's pose; --policy.state_symmetry={self.state_symmetry}"
+                f" lacks {self.missing_of_gripper}: make the view without it, by "
                 "--policy.view='{name: reproj, clip: none}' or '{name: persp, plane_height: 0}', and a dataset's views "
                 "by symview-add-views --reproj.clip=none or --persp.plane_height=0"
             )
-        return [self.state_symmetry.index(label) for label in keys.STATE_NAMES]
+        return columns
+
+    @property
+    def gripper_turns(self) -> bool:
+        """Whether actions turn the gripper about the vertical."""
+        return bool(self.actions.of_type("yaw"))
+
+    @property
+    def missing_of_gripper(self) -> str:
+        """The dimensions that the state lacks and without which the gripper's pose is unknown; empty if it is known."""
+        return missing_of(self.state_symmetry, self.gripper_turns)
 
     @property
     def merged_cameras(self) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from lerobot_policy_symview.symmetry.groups import make_group
-from lerobot_symview import keys
 from lerobot_symview.registry import check_name
 from lerobot_symview.runtime.cli import flagged
 from lerobot_symview.views import VIEWS
@@ -58,11 +57,10 @@ def check_combination(config: SymviewConfig) -> None:
             "--policy.camera_rays=true gives the rays of the camera's own image, which are no scalars: use "
             f"--policy.view=side and --policy.encoder=plain, got {config.view.name} and {config.encoder}"
         )
-    missing = [label for label in keys.STATE_NAMES if label not in config.state_symmetry]
-    if config.gripper_input == "image" and missing:
+    if config.gripper_input == "image" and config.missing_of_gripper:
         raise ValueError(
-            f"--policy.gripper_input=image draws the gripper's {', '.join(keys.STATE_NAMES)}; "
-            f"--policy.state_symmetry={config.state_symmetry} lacks {missing}: use --policy.gripper_input=vector"
+            f"--policy.gripper_input=image draws the gripper; --policy.state_symmetry={config.state_symmetry} lacks "
+            f"{config.missing_of_gripper}: use --policy.gripper_input=vector"
         )
     if config.augmentation != "none":
         _check_augmentation(config)
@@ -79,7 +77,8 @@ def _check_augmentation(config: SymviewConfig) -> None:
             "--policy.augmentation=group is the identity with --policy.group=C1: "
             "use --policy.augmentation=d4, so2 or o2"
         )
-    if config.gripper_input == "none" or not config.states.of_type("yaw"):
+    turns = config.states.of_type("yaw") or config.gripper_turns
+    if turns and (config.gripper_input == "none" or not config.states.of_type("yaw")):
         raise ValueError(
             f"--policy.augmentation={config.augmentation} rotates the gripper with the scene, but its yaw is not an "
             f"input of the network with --policy.gripper_input={config.gripper_input} and --policy.state_symmetry="

@@ -1,10 +1,10 @@
-"""The simulated tasks as a LeRobot environment: `--env.type=symview`."""
+"""The simulators as LeRobot environments: `--env.type=symview`, `symview_metaworld`, `symview_fetch`."""
 
 from __future__ import annotations
 
 import multiprocessing
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -14,29 +14,26 @@ from lerobot.processor import PolicyProcessorPipeline
 
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 from lerobot_symview import keys
+from lerobot_symview.geometry.gripper_state import gripper_columns
 from lerobot_symview.geometry.units import METRES
 from lerobot_symview.runtime.flag_errors import FlagError, flag_errors
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import EnvSettings, WorldSettings
+from symview_sim.worlds.fetch import FetchSettings
+from symview_sim.worlds.metaworld import MetaWorldSettings, check_task
 
-# The modules of a simulator process: the fork server imports them once, instead of six seconds in each process.
-PRELOADED = ["lerobot.envs.utils", "symview_sim.env"]
 
-
-@EnvConfig.register_subclass("symview")
 @dataclass
-class SymviewEnvConfig(EnvSettings, EnvConfig):
-    """PyBullet tabletop tasks, observed by freely placed RGBD cameras.
+class WorldEnvConfig(WorldSettings, EnvConfig):
+    """What the environments of all simulators have in common. Derived classes also derive from their settings.
 
     Raises:
         FlagError: if a value is invalid; LeRobot's commands print the message.
     """
 
-    task: str = "block_picking"
-    """Name of the task, such as `block_picking`; several names separated by commas; or `all`."""
-    fps: int = 4
-    """Actions per second, the simulated robot's speed."""
+    fps: int = 0
+    """Actions per second; it follows from the simulator."""
     views: list[ViewSpec] = field(default_factory=list)
     """Views of the first camera to add to each observation, for policies that do not render their own: names, or names
     with options, `[reproj, {name: persp, plane_height: 0.025}]`."""
@@ -46,6 +43,10 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
     """Options of the view `reproj`."""
     persp: PerspectiveView = field(default_factory=PerspectiveView)
     """Options of the view `persp`."""
+
+    settings_class: ClassVar[type[WorldSettings]]
+    preloaded: ClassVar[tuple[str, ...]] = ("lerobot.envs.utils", "symview_sim.table_env")
+    """Modules of a simulator's process: the fork server imports them once, instead of six seconds in each process."""
 
     def __post_init__(self) -> None:
         with flag_errors("--env: "):
@@ -57,7 +58,7 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
             shapes[keys.rgb(camera.name)] = (*size, 3)
             if self.depth:
                 shapes[keys.depth(camera.name)] = (*size, 1)
-            if self.segmentation:
+            if self.has_labels:
                 shapes[keys.segmentation(camera.name)] = (*size, 3)
         for name, view in views.items():
             if view.needs_depth and not self.depth:
@@ -77,11 +78,12 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
             for output, kind in view.outputs.items():
                 shapes[keys.view(self.camera.name, output)] = (view.size, view.size, 3 if kind == "rgb" else 1)
         self.features = {
-            keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(keys.ACTION_NAMES),)),
-            keys.STATE: PolicyFeature(FeatureType.STATE, (len(keys.STATE_NAMES),)),
+            keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(self.action_names),)),
+            keys.STATE: PolicyFeature(FeatureType.STATE, (len(self.state_names),)),
             **{key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in shapes.items()},
         }
         self.features_map = {key: key for key in self.features}
+        self.fps = self.actions_per_second
 
     def _make_views(self) -> dict[str, View]:
         options: dict[str, View] = {"reproj": self.reproj, "persp": self.persp}
@@ -89,20 +91,18 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """The fields of `EnvSettings` except the task."""
-        names = [setting.name for setting in fields(EnvSettings) if setting.name != "task"]
+        """The fields of the simulator's settings except the task."""
+        names = [setting.name for setting in fields(self.settings_class) if setting.name != "task"]
         return {name: getattr(self, name) for name in names}
 
     @property
     def tasks(self) -> list[str]:
         """Names of the tasks."""
-        from symview_sim.tasks import TASK_NAMES
+        return list(self.task_names()) if self.task == "all" else [name.strip() for name in self.task.split(",")]
 
-        return list(TASK_NAMES) if self.task == "all" else [name.strip() for name in self.task.split(",")]
-
-    def settings(self) -> dict[str, EnvSettings]:
+    def settings(self) -> dict[str, WorldSettings]:
         """Return task -> settings."""
-        return {task: EnvSettings(task=task, **self.gym_kwargs) for task in self.tasks}
+        return {task: self.settings_class(task=task, **self.gym_kwargs) for task in self.tasks}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
@@ -117,7 +117,7 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
                 task: {0: gymnasium.vector.SyncVectorEnv([freeze_after_episode_end(settings.make)] * n_envs)}
                 for task, settings in self.settings().items()
             }
-        multiprocessing.get_context("forkserver").set_forkserver_preload(PRELOADED)
+        multiprocessing.get_context("forkserver").set_forkserver_preload(list(self.preloaded))
         # A bound method of plain settings: simulator processes unpickle it without importing LeRobot's registries.
         return {task: {0: _LazyAsyncVectorEnv([settings.make] * n_envs)} for task, settings in self.settings().items()}
 
@@ -126,6 +126,59 @@ class SymviewEnvConfig(EnvSettings, EnvConfig):
         views = [ViewSpec(name, asdict(view)).plain() for name, view in self._make_views().items()]
         depth_units: dict[str, float] = dict.fromkeys((key for key in self.features if key.endswith("_depth")), METRES)
         step = ViewsProcessorStep(
-            views=views, camera=self.camera.name, workspace=asdict(self.workspace), depth_units=depth_units
+            views=views,
+            camera=self.camera.name,
+            workspace=asdict(self.workspace),
+            gripper=gripper_columns(self.state_names) or [],
+            depth_units=depth_units,
         )
         return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])
+
+
+@EnvConfig.register_subclass("symview")
+@dataclass
+class SymviewEnvConfig(EnvSettings, WorldEnvConfig):
+    """PyBullet tabletop tasks, observed by freely placed RGBD cameras.
+
+    Raises:
+        FlagError: if a value is invalid; LeRobot's commands print the message.
+    """
+
+    task: str = "block_picking"
+    """Name of the task, such as `block_picking`; several names separated by commas; or `all`."""
+
+    settings_class = EnvSettings
+    preloaded = ("lerobot.envs.utils", "symview_sim.env")
+
+
+@EnvConfig.register_subclass("symview_metaworld")
+@dataclass
+class MetaWorldEnvConfig(MetaWorldSettings, WorldEnvConfig):
+    """Meta-World's tasks, observed by freely placed RGBD cameras.
+
+    Raises:
+        FlagError: if a value is invalid; LeRobot's commands print the message.
+    """
+
+    task: str = "push-v3"
+    """Name of the task, such as `push-v3`; several names separated by commas; or `all`."""
+
+    settings_class = MetaWorldSettings
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        with flag_errors("--env: "):
+            for task in self.tasks:
+                check_task(task)
+
+
+@EnvConfig.register_subclass("symview_fetch")
+@dataclass
+class FetchEnvConfig(FetchSettings, WorldEnvConfig):
+    """FetchPush, observed by freely placed RGBD cameras.
+
+    Raises:
+        FlagError: if a value is invalid; LeRobot's commands print the message.
+    """
+
+    settings_class = FetchSettings

@@ -22,10 +22,8 @@ from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.units import (
-    METRES,
-    parse_unit,
-)
+from lerobot_symview.geometry.gripper_state import gripper_poses
+from lerobot_symview.geometry.units import METRES, parse_unit
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
 from lerobot_symview.views import Frame, View, ViewSpec, make_views, other_cameras
 
@@ -55,8 +53,9 @@ class ViewsProcessorStep(ObservationProcessorStep):
         camera: the camera from which they are made.
         workspace: constructor arguments of `Workspace`; by default the calibration's, or the default one.
         calibration: content of a calibration file (`lerobot_symview.calibration`), or nothing.
-        gripper: indices of the gripper's x, y, z, yaw and aperture in `observation.state`; none where the gripper's
-            state is unknown: then nothing is clipped and no gripper image is drawn.
+        gripper: indices of the gripper's x, y, z, yaw and aperture in `observation.state`, null for a yaw or aperture
+            that it lacks; none where the gripper's state is unknown: then nothing is clipped and no gripper image is
+            drawn.
         depth_units: feature -> `m`, `mm` or metres per unit, the unit in which depth and height images arrive. It is
             not stored in checkpoints: LeRobot's loader delivers millimetres where an environment delivers metres. Units
             that are not given are the calibration's; else, for the cameras of views, the one that shows the table at
@@ -75,7 +74,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
     camera: str = "side"
     workspace: dict[str, Any] = field(default_factory=dict)
     calibration: dict[str, Any] = field(default_factory=dict)
-    gripper: list[int] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
+    gripper: list[int | None] = field(default_factory=lambda: list(range(len(keys.STATE_NAMES))))
     depth_units: dict[str, Any] = field(default_factory=dict)
     augmentation: float = 0.0
     require_views: bool = False
@@ -229,7 +228,8 @@ class ViewsProcessorStep(ObservationProcessorStep):
         needed = []
         if self.gripper and any(view.uses_gripper for view in views.values()):
             needed.append(keys.STATE)
-            gripper = observation[keys.STATE].detach()[:, self.gripper] if keys.STATE in observation else None
+            if keys.STATE in observation:
+                gripper = gripper_poses(observation[keys.STATE].detach(), self.gripper)
         batches: dict[str, FrameBatch] = {}
         for name, camera in self._observed.items():
             merging = [view for view in views.values() if name == self.camera or name in view.cameras]

@@ -28,7 +28,7 @@ from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.flag_errors import FlagError
 from lerobot_symview.views import ViewSpec, make_view
-from symview_sim.env import named_features
+from symview_sim.camera_rig import named_features
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import EnvSettings, NewDataset
 from symview_sim.simulators import Reset, SimulatorConfig, Simulators

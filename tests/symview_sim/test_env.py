@@ -185,7 +185,7 @@ def test_render_returns_256_rows():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_gripper_rotates_in_place_past_90_degrees(robot):
-    env = EnvSettings("block_picking", robot, camera=TINY).make()
+    env = EnvSettings("block_picking", robot=robot, camera=TINY).make()
     env.reset(seed=0)
     errors = []
     for direction in (1, -1):
@@ -248,7 +248,7 @@ def _expert_states(env, seed):
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_the_expert_succeeds(task, robot):
-    env = EnvSettings(task, robot).make()
+    env = EnvSettings(task, robot=robot).make()
     outcomes, lengths = [], []
     for seed in range(10):
         env.reset(seed=episode_seed(0, seed))
@@ -358,7 +358,7 @@ def test_importing_the_package_imports_no_simulator():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_gripper_reaches_its_target(robot):
-    env = EnvSettings("block_picking", robot).make()
+    env = EnvSettings("block_picking", robot=robot).make()
     arm = env.scene.arm
     for x, y, z, yaw in [(0.45, 0.0, 0.2, 0.0), (0.25, -0.2, 0.03, 1.5), (0.65, 0.2, 0.02, -1.5)]:
         arm.reset((x, y, z), yaw)

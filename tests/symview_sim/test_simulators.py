@@ -38,7 +38,7 @@ def test_observations_equal_those_of_the_environment_and_the_view(simulators):
     from lerobot_symview.geometry.camera import stored_camera
     from lerobot_symview.geometry.workspace import Workspace
     from lerobot_symview.views import Frame, ReprojectedView
-    from symview_sim.env import named_features
+    from symview_sim.camera_rig import named_features
 
     outcome = run(simulators, 0, Reset(7))
     env = CONFIG.env.make()

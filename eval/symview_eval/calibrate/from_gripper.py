@@ -144,7 +144,7 @@ def _pose_columns(features: Features) -> tuple[list[int], bool]:
     """Return the indices of position and turn in the state, and whether positions are relative to the workspace."""
     ours = gripper_dimensions(features)
     if ours is not None:
-        return ours[:4], True
+        return [column for column in ours[:4] if column is not None], True
     names = features.get(keys.STATE, {}).get("names") or []
     if not set(EE_NAMES) <= set(names):
         raise DatasetError(

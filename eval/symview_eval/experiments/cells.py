@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import cast
 
 import torch
 
@@ -30,8 +31,9 @@ from symview_eval.experiments.cloning import policy_config, run_cloning
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.placements import evaluate_placements
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
-from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import EnvSettings, NewDataset
+from symview_eval.experiments.simulators import world_settings
+from symview_sim.generate import GenerateConfig, RecordedWorld, generate
+from symview_sim.settings import EnvSettings, NewDataset, WorldSettings
 
 logger = logging.getLogger(__name__)
 
@@ -108,8 +110,11 @@ def _attempt(job: CellJob, work: Callable[[CellJob], None]) -> Outcome:
 
 def _record(job: CellJob) -> None:
     cell = job.cell
-    env = RecordedEnv(task=cell.task, camera=cell.row.camera, more_cameras=cell.row.more_cameras)
-    generate(GenerateConfig(job.demonstrations, env, num_episodes=cell.demonstrations, seed=cell.seed, resume=True))
+    env = world_settings(cell.task, oracle=True, camera=cell.row.camera, more_cameras=cell.row.more_cameras)
+    recorded = cast(RecordedWorld, env)  # the flag `--env.type` needs a class of its own
+    generate(
+        GenerateConfig(job.demonstrations, recorded, num_episodes=cell.demonstrations, seed=cell.seed, resume=True)
+    )
     if cell.row.remembers:
         source, target = job.demonstrations, job.training_data
         add_views(
@@ -125,15 +130,16 @@ def _record(job: CellJob) -> None:
 
 def _run(job: CellJob) -> None:
     cell, start = job.cell, time.perf_counter()
-    env = EnvSettings(
-        task=cell.task,
+    env = world_settings(
+        cell.task,
+        oracle=cell.row.policy["method"].startswith("oracle"),
         camera=cell.row.camera,
         more_cameras=cell.row.more_cameras,
-        oracle=cell.row.policy["method"].startswith("oracle"),
         max_steps=cell.scale.max_steps,
     )
     times = Times()
     if cell.algorithm == "sacfd":
+        assert isinstance(env, EnvSettings)
         checkpoints = _run_rl(job, env)
     elif cell.placements:
         if not job.policy.is_dir():
@@ -152,7 +158,7 @@ def _run(job: CellJob) -> None:
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
 
 
-def _train(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
+def _train(job: CellJob, env: WorldSettings) -> tuple[list[Checkpoint], Times]:
     """Clone the demonstrations and save the policy; return the evaluations during the training and its times."""
     training = run_cloning(job.cell, open_dataset(job.training_data), env, job.device)
     part = part_of(job.policy)

@@ -26,7 +26,7 @@ from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, Evaluatio
 from lerobot_symview import keys
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Times, checkpoint
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import WorldSettings
 from symview_sim.simulators import Simulators
 
 AUGMENTED_VARIANTS = 16  # of every frame, with camera augmentation; LeRobot's training makes a new one each time
@@ -124,7 +124,7 @@ def policy_config(cell: Cell, device: str) -> SymviewBcConfig:
     return config
 
 
-def run_cloning(cell: Cell, dataset: Any, env: EnvSettings, device: str) -> CloningResult:
+def run_cloning(cell: Cell, dataset: Any, env: WorldSettings, device: str) -> CloningResult:
     """Train a cell's policy with LeRobot's own update, and evaluate it at every checkpoint.
 
     Args:

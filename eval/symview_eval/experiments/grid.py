@@ -17,6 +17,8 @@ from symview_eval.experiments.rows import (
     CLONED_TASKS,
     CLOUD,
     ELEVATIONS,
+    FOREIGN,
+    FOREIGN_MOVED,
     ORACLE,
     ORACLE_RGB,
     PERSP,
@@ -39,6 +41,7 @@ from symview_eval.experiments.rows import (
     with_varying_camera,
 )
 from symview_eval.experiments.scale import Algorithm, Scale
+from symview_eval.experiments.simulators import FOREIGN_TASKS
 from symview_sim.tasks import TASK_NAMES
 
 HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps for SACfD
@@ -82,7 +85,8 @@ class Cell:
     def recording(self) -> str:
         """Name of its demonstrations, which all methods with the same camera share."""
         camera, others = self.row.camera, self.row.more_cameras
-        kind = f"{'_varying' if camera.varies else ''}{'' if camera.sees_robot else '_without_arm'}"
+        azimuth = f"_azimuth{camera.azimuth_deg:g}" if camera.azimuth_deg else ""
+        kind = f"{azimuth}{'_varying' if camera.varies else ''}{'' if camera.sees_robot else '_without_arm'}"
         cameras = "_".join([f"{camera.elevation_deg:g}deg{kind}", *(other.name for other in others)])
         return f"{self.task}_{cameras}_{self.demonstrations}_seed{self.seed}"
 
@@ -96,7 +100,7 @@ class Cell:
         """Training steps of behaviour cloning, or joint steps of reinforcement learning."""
         is_harder = self.task in HARDER_TASKS
         if self.algorithm == "bc":
-            return self.scale.harder_steps if is_harder else self.scale.steps
+            return self.row.longer * (self.scale.harder_steps if is_harder else self.scale.steps)
         return self.scale.rl_steps * (2 if is_harder else 1)
 
     @property
@@ -117,11 +121,12 @@ class Cell:
     @property
     def training(self) -> dict[str, Any]:
         """All settings that determine its policy and the evaluations during the training."""
-        scale = self.scale
+        scale, camera = self.scale, self.row.camera
         return {
             "algorithm": self.algorithm,
             "policy": {**scale.policy(self.algorithm), **self.row.policy},
             "elevation_deg": self.row.camera.elevation_deg,
+            **({"placed": [camera.azimuth_deg, camera.distance]} if _is_placed(camera) else {}),
             **({"spread": asdict(self.row.camera.spread)} if self.row.camera.varies else {}),
             **({} if self.row.camera.sees_robot else {"sees_robot": False}),
             **({"more_cameras": [asdict(camera) for camera in self.row.more_cameras]} if self.row.more_cameras else {}),
@@ -150,6 +155,12 @@ class Cell:
 
     def __str__(self) -> str:
         return f"{self.row.name} on {self.task}, {self.demonstrations} demonstrations, seed {self.seed}"
+
+
+def _is_placed(camera: CameraSpec) -> bool:
+    """Whether a camera has another azimuth or distance than the paper's."""
+    paper = CameraSpec()
+    return (camera.azimuth_deg, camera.distance) != (paper.azimuth_deg, paper.distance)
 
 
 def _hash(settings: dict[str, Any]) -> str:
@@ -265,6 +276,15 @@ EXPERIMENTS = {
             ),
             CLONED_TASKS,
             (10,),
+        ),
+        Experiment("metaworld", "Simulators that others wrote", FOREIGN, FOREIGN_TASKS, (25,)),
+        Experiment(
+            "metaworld_moved",
+            "Simulators that others wrote, and a camera that is moved after the training",
+            FOREIGN,
+            FOREIGN_TASKS,
+            (25,),
+            placements=FOREIGN_MOVED,
         ),
         Experiment(
             "figure7",

@@ -10,11 +10,11 @@ from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.rl.rollouts import EVALUATION_SEED, Actor, evaluate, simulator_config
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.results import Checkpoint, Times, checkpoint
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import WorldSettings
 from symview_sim.simulators import Simulators
 
 
-def evaluate_placements(cell: Cell, policy: SymviewPolicy, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
+def evaluate_placements(cell: Cell, policy: SymviewPolicy, env: WorldSettings) -> tuple[list[Checkpoint], Times]:
     """Evaluate a policy with each of a cell's cameras, in the same scenes.
 
     Args:

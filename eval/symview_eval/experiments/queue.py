@@ -12,10 +12,12 @@ from lerobot_symview.registry import lookup
 from symview_eval.experiments.grid import EXPERIMENTS, Cell, Experiment, select
 from symview_eval.experiments.results import Result
 from symview_eval.experiments.scale import Scale
+from symview_eval.experiments.simulators import FOREIGN_TASKS
 from symview_sim.tasks import TASK_NAMES
 
 ALL = "all"
 FIRST_TASKS = ("block_picking", "drawer_opening")  # of the figures
+FIRST_FOREIGN_TASKS = ("push-v3", "pick-place-v3", "reach-v3", "plate-slide-v3")
 TRANSFER_TASKS = ("block_picking", "block_pushing", "drawer_opening")
 
 
@@ -79,15 +81,16 @@ def chosen_cells(
     if name != ALL:
         return select(EXPERIMENTS[name], scale, tasks, methods, demos, seeds)
     rows = {row.name: row for experiment in EXPERIMENTS.values() for row in experiment.rows}
+    known = (*TASK_NAMES, *FOREIGN_TASKS)
     for task in tasks:
-        lookup("--tasks entry", task, dict.fromkeys(TASK_NAMES))
+        lookup("--tasks entry", task, dict.fromkeys(known))
     for method in methods:
         lookup("--methods entry", method, rows)
     cells = [cell for experiment in EXPERIMENTS.values() for cell in select(experiment, scale, seeds=seeds)]
     cells = [
         cell
         for cell in cells
-        if cell.task in (tasks or TASK_NAMES)
+        if cell.task in (tasks or known)
         and cell.row.name in (methods or rows)
         and cell.demonstrations in (demos or [cell.demonstrations])
     ]
@@ -103,6 +106,8 @@ def _rank(cell: Cell) -> int:
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
         return 2
     if cell.experiment in ("transfer", "robustness", "hidden") and cell.task in TRANSFER_TASKS:
+        return 2
+    if cell.experiment.startswith("metaworld") and (cell.task in FIRST_FOREIGN_TASKS or cell.seed == 0):
         return 2
     return 3
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lerobot_policy_symview.methods import METHODS
@@ -25,6 +25,8 @@ class MethodRow:
     """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
     more_cameras: tuple[CameraSpec, ...] = ()
     """Further cameras, which the view merges."""
+    longer: int = 1
+    """Factor of the number of training steps."""
 
     @property
     def remembers(self) -> bool:
@@ -120,6 +122,37 @@ def with_varying_camera(row: MethodRow) -> MethodRow:
     """Return the row with demonstrations by a new camera in every episode."""
     camera = CameraSpec(spread=ANYWHERE)
     return MethodRow(f"{row.name}_varying", f"{row.label}, trained with many cameras", row.policy, camera)
+
+
+FOREIGN_CAMERA = CameraSpec(azimuth_deg=60.0, distance=1.0)
+FOREIGN_MOVED = (
+    ("training", FOREIGN_CAMERA),
+    *((f"azimuth {azimuth}°", replace(FOREIGN_CAMERA, azimuth_deg=azimuth)) for azimuth in (-60, 0, 90, 120)),
+    *((f"elevation {elevation}°", replace(FOREIGN_CAMERA, elevation_deg=elevation)) for elevation in (30, 60)),
+)
+
+
+def in_foreign_world(row: MethodRow, longer: int = 1) -> MethodRow:
+    """Return the row with demonstrations of a simulator that others wrote, and a factor of the training steps."""
+    return replace(row, camera=FOREIGN_CAMERA, longer=longer)
+
+
+def _around_gripper(name: str, label: str, **policy: Any) -> MethodRow:
+    """Return reproj_equi without the arm over the gripper only: objects beside it may be higher than it."""
+    return method_row(name, label, "reproj_equi", view_options={"clip_radius": 0.12}, **policy)
+
+
+FOREIGN = (
+    in_foreign_world(_around_gripper("reproj_equi_around", "Reproj. Equi, clipped around the gripper")),
+    in_foreign_world(REPROJ),
+    in_foreign_world(
+        _around_gripper("reproj_nonequi_around", "Reproj. NonEqui, clipped around the gripper", encoder="plain")
+    ),
+    in_foreign_world(PERSP),
+    in_foreign_world(SIDE),
+    in_foreign_world(PLAIN),
+    in_foreign_world(method_row("sideview_equi_longer", "Sideview Equi, 5 x as many steps", "sideview_equi"), longer=5),
+)
 
 
 def with_plane_height(name: str, label: str, plane_height: float | str) -> MethodRow:

@@ -10,6 +10,7 @@ import numpy as np
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.symmetry.representations import types_of
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
 from lerobot_symview.datasets.features import image_size
@@ -73,13 +74,19 @@ def name_inputs(config: SymviewConfig) -> None:
 
 
 def _check_vectors(config: SymviewConfig, features: Features) -> None:
-    for representation, key in ((config.states, keys.STATE), (config.actions, keys.ACTION)):
+    """Check the declared types of state and action; where they are the default, read them from the dataset's names."""
+    for kind, key in (("state", keys.STATE), ("action", keys.ACTION)):
         if key not in features:
             raise ValueError(f"the dataset lacks {key!r}, which the policy needs; it has {sorted(features)}")
         names = features[key].get("names")
-        are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        size = int(features[key]["shape"][0])
-        representation.check(size, key, names if are_names and config.group != "C1" else None)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            names = None
+        types = types_of(names or ())
+        if types and getattr(config, f"{kind}_symmetry") == keys.STATE_NAMES:
+            setattr(config, f"{kind}_symmetry", types)
+        representation = config.states if kind == "state" else config.actions
+        representation.check(int(features[key]["shape"][0]), key, names if config.group != "C1" else None)
+    config.check()  # options that depend on the types
 
 
 def _own_names(config: SymviewConfig, features: Features) -> Features:
@@ -114,7 +121,7 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
     else:
         raw = features.get(keys.rgb(config.seen_camera), {}).get("info") or {}
         config.workspace = dict(raw.get("symview", {}).get("workspace", config.workspace))
-        if config.is_computed and not set(keys.STATE_NAMES) <= set(config.state_symmetry):
+        if config.is_computed and config.missing_of_gripper:
             changed = _changed_options(config.make_view(), config.make_view().without_gripper())
             config.view = ViewSpec(config.view.name, config.view.options | changed)
 

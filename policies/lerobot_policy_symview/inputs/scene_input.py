@@ -25,6 +25,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration
 from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.gripper import gripper_image
+from lerobot_symview.geometry.gripper_state import POSE, gripper_columns, gripper_poses
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
 
@@ -197,7 +198,7 @@ class ImageInput(SceneInput):
         if transform is not None:
             images = transform_images(images, transform)
         if self.config.gripper_input == "image":
-            images = torch.cat([images, self._gripper(state, images.shape[-1])[:, None]], dim=1)
+            images = torch.cat([images, self._gripper(state, transform, images.shape[-1])[:, None]], dim=1)
         return crop(images, self.config.crop_size, crop_offset), state
 
     def downscale(self, images: Tensor) -> Tensor:
@@ -226,10 +227,14 @@ class ImageInput(SceneInput):
         cameras = self._lenses(batch, calibrated)
         return plucker_rays(*self._calibration(batch), calibrated, size, self.workspace, cameras)
 
-    def _gripper(self, state: Tensor, pixels: int) -> Tensor:
-        """Draw the gripper (B, pixels, pixels)."""
-        pose = [state[:, self.config.state_symmetry.index(label)] for label in keys.STATE_NAMES]
-        drawn: Tensor = gripper_image(torch.stack(pose, dim=-1), self.workspace, pixels)
+    def _gripper(self, state: Tensor, transform: PlanarTransform | None, pixels: int) -> Tensor:
+        """Draw the gripper (B, pixels, pixels); a hand without yaw turns with a transformed scene only."""
+        columns = gripper_columns(self.config.state_symmetry, self.config.gripper_turns)
+        assert columns is not None  # checked with the configuration
+        pose = gripper_poses(state, columns)
+        if columns[POSE.index("yaw")] is None and transform is not None:
+            pose[:, POSE.index("yaw")] = transform.angle
+        drawn: Tensor = gripper_image(pose, self.workspace, pixels)
         return drawn
 
 

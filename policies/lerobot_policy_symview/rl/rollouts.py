@@ -20,7 +20,7 @@ from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.units import METRES
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import WorldSettings
 from symview_sim.simulators import Observation, Reset, SimulatorConfig, Simulators, Step
 
 EVALUATION_SEED = 1000  # first seed of lerobot-eval, so that both evaluate on the same scenes
@@ -71,20 +71,18 @@ def metric_depth(config: SymviewConfig) -> dict[str, float]:
     return {key: METRES for key in depth if key is not None}
 
 
-def simulator_config(config: SymviewConfig, env: EnvSettings) -> SimulatorConfig:
+def simulator_config(config: SymviewConfig, env: WorldSettings) -> SimulatorConfig:
     """Return the configuration of simulators of `env` whose observations have the features that a policy needs.
 
     Raises:
         ValueError: if `config.state_symmetry` does not fit the simulators' state.
     """
-    config.states.check(len(keys.STATE_NAMES), keys.STATE)
-    if any(
-        kind in keys.STATE_NAMES and kind != name
-        for kind, name in zip(config.state_symmetry, keys.STATE_NAMES, strict=True)
-    ):
+    names = env.state_names
+    config.states.check(len(names), keys.STATE)
+    if any(kind in names and kind != name for kind, name in zip(config.state_symmetry, names, strict=True)):
         raise ValueError(
             f"--policy.state_symmetry={config.state_symmetry} does not fit the simulators' state, which is "
-            f"[{', '.join(keys.STATE_NAMES)}]"
+            f"[{', '.join(names)}]"
         )
     return SimulatorConfig(
         env=env,

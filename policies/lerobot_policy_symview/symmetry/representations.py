@@ -87,9 +87,10 @@ class VectorRepresentation:
         """
         if len(self.dimensions) != size:
             called = f" ({', '.join(names)})" if names else ""
+            example = ", ".join(_type_of(name) or "scalar" for name in names or ["x", "y", "z", "yaw", "aperture"])
             raise ValueError(
                 f"{self.flag} describes {len(self.dimensions)} dimensions, {list(self.dimensions)}; {feature!r} has "
-                f"{size}{called}: give one type for each, such as {self.flag}='[x, y, z, yaw, aperture]'"
+                f"{size}{called}: give one type for each, such as {self.flag}='[{example}]'"
             )
         wrong = [
             f"{name!r} as {label!r}"
@@ -175,6 +176,22 @@ class VectorRepresentation:
         for index in self.signs:
             center[index], width[index] = 0.0, extent[index]
         return center, torch.where(width > SMALLEST_EXTENT, width, torch.ones_like(width))
+
+
+def types_of(names: Sequence[str]) -> list[str] | None:
+    """Return the types that the names of dimensions are, or are increments of, such as `dx`; None if any is neither."""
+    types = [_type_of(name) for name in names]
+    known = [kind for kind in types if kind is not None]
+    try:
+        VectorRepresentation(tuple(known))
+    except ValueError:  # such as an x without a y
+        return None
+    return known if known and len(known) == len(types) else None
+
+
+def _type_of(name: str) -> str | None:
+    """Return the type that a dimension's name is, or is an increment of; None if it is neither."""
+    return next((kind for kind in (name, name.removeprefix("d")) if kind in TYPES), None)
 
 
 def _can_be(name: str, kind: str) -> bool:

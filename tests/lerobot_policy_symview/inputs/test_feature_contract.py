@@ -68,6 +68,35 @@ def test_an_invalid_calibration_is_an_error_where_it_is_used(tmp_path):
     assert calibration_of(meta, method="sideview_equi") == {}
 
 
+def with_vectors(state, action):
+    """Features of a camera, a state and an action with named dimensions."""
+    features = {keys.rgb("side"): {"dtype": "image", "shape": (76, 76, 3)}}
+    features |= {keys.depth("side"): {"dtype": "image", "shape": (76, 76, 1), "info": {"is_depth_map": True}}}
+    named = ((keys.STATE, state), (keys.ACTION, action))
+    return features | {key: {"dtype": "float32", "shape": (len(names),), "names": names} for key, names in named}
+
+
+def test_the_types_of_state_and_action_are_read_from_their_names():
+    config = make_config()
+    read_features(config, with_vectors(["z", "x", "y", "aperture"], ["dx", "dy", "dz", "aperture"]))
+    assert config.state_symmetry == ["z", "x", "y", "aperture"]
+    assert config.action_symmetry == ["x", "y", "z", "aperture"]
+    assert config.gripper_indices == [1, 2, 0, None, 3]
+    assert config.view.options.get("clip", "gripper") == "gripper"
+
+
+def test_declared_types_take_precedence_over_names():
+    config = make_config(state_symmetry=["x", "y", "z", "scalar"], action_symmetry=["x", "y", "z", "scalar"])
+    read_features(config, with_vectors(["x", "y", "z", "aperture"], ["dx", "dy", "dz", "aperture"]))
+    assert config.state_symmetry == config.action_symmetry == ["x", "y", "z", "scalar"]
+
+
+def test_the_message_suggests_one_type_for_each_of_the_datasets_dimensions():
+    features = with_vectors(["x", "y", "z", "grip"], ["dx", "dy", "dz", "aperture"])
+    with pytest.raises(ValueError, match=r"has 4 \(x, y, z, grip\): .*state_symmetry='\[x, y, z, scalar\]'"):
+        read_features(make_config(), features)
+
+
 @pytest.mark.parametrize("method", ["sideview_equi", "point_cloud_equi", "voxel_equi"])
 @pytest.mark.parametrize("has_sensor", [True, False], ids=["with a sensor's calibration", "of another size"])
 def test_methods_that_read_raw_depth_refuse_depth_that_is_not_aligned(method, has_sensor):

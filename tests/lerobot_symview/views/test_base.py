@@ -51,7 +51,10 @@ def test_a_view_is_a_pure_function(name):
 
 
 @pytest.mark.parametrize("quarter_turns", [1, 2, 3])
-@pytest.mark.parametrize(("name", "options"), [("reproj", {"infill": "none"}), ("persp", {})])
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("reproj", {"infill": "none"}), ("reproj", {"infill": "none", "clip_radius": 0.07}), ("persp", {})],
+)
 def test_views_rotate_with_camera_and_gripper(name, options, quarter_turns):
     view = make_view(name, size=SIZE, **options)
     frame = make_frame(gripper=(0.05, -0.08, 0.2, 0.3, 0.8))
@@ -77,6 +80,22 @@ def test_points_above_the_gripper_are_removed():
     cut = make_view("reproj", size=SIZE).render(frame)["reproj_height"]
     assert free.max() > 0.09
     assert cut.max() <= 0.09 + 1e-6
+
+
+def test_with_a_clip_radius_points_beside_the_gripper_are_kept():
+    """Two towers are higher than the gripper: the one over it is the arm."""
+    camera = make_camera(90.0, size=SIZE, fov=2 * np.rad2deg(np.arctan(0.2 / 0.81)))
+    rgb = np.zeros((SIZE, SIZE, 3), np.uint8)
+    depth = np.full((SIZE, SIZE), 0.81, np.float32)
+    depth[4:6, 4:6], depth[24:26, 24:26] = 0.66, 0.66
+    xy = Workspace().xy_from_pixel(np.array([4.5, 4.5]), SIZE) - CENTRE
+    frame = Frame(rgb, depth, camera, Workspace(), np.array([*xy, 0.1, 0.0, 1.0]))
+    height = make_view("reproj", size=SIZE, clip_radius=0.1, infill="none").render(frame)["reproj_height"]
+    assert height[: SIZE // 2, : SIZE // 2].max() < 1e-6
+    assert height[SIZE // 2 :, SIZE // 2 :].max() > 0.14
+    assert make_view("reproj", size=SIZE, infill="none").render(frame)["reproj_height"].max() < 1e-6
+    unknown = replace(frame, gripper=None)
+    assert make_view("reproj", size=SIZE, clip_radius=0.1, infill="none").render(unknown)["reproj_height"].max() > 0.14
 
 
 def test_points_below_the_clip_floor_are_kept():
@@ -141,6 +160,9 @@ def test_an_unknown_view_error_suggests_the_closest_name():
         ("reproj", {"clip_margin": np.nan}),
         ("reproj", {"clip_margin": np.inf}),
         ("reproj", {"clip_floor": np.nan}),
+        ("reproj", {"clip_radius": -0.1}),
+        ("reproj", {"clip_radius": np.inf}),
+        ("reproj", {"clip_radius": 0.1, "clip": "none"}),
         ("reproj", {"clip_floor": -np.inf}),
         ("reproj", {"source_scale": 1.5}),
         ("reproj", {"source_scale": np.nan}),

@@ -1,0 +1,1 @@
+"""Simulators that others wrote on MuJoCo, with freely placed cameras. Importing this package does not import MuJoCo."""

@@ -1,0 +1,32 @@
+"""The simulator of each task of the experiments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from symview_sim.settings import EnvSettings, WorldSettings
+from symview_sim.worlds.fetch import FetchSettings
+from symview_sim.worlds.metaworld import MetaWorldSettings
+
+METAWORLD_TASKS = (
+    "push-v3",
+    "pick-place-v3",
+    "reach-v3",
+    "plate-slide-v3",
+    "drawer-open-v3",
+    "button-press-topdown-v3",
+    "sweep-v3",
+    "sweep-into-v3",
+    "coffee-push-v3",
+)
+FOREIGN: dict[str, type[WorldSettings]] = dict.fromkeys(METAWORLD_TASKS, MetaWorldSettings) | {
+    "FetchPush": FetchSettings
+}
+FOREIGN_TASKS = tuple(FOREIGN)
+
+
+def world_settings(task: str, *, oracle: bool, **settings: Any) -> WorldSettings:
+    """Return the settings of a task's simulator; only PyBullet's has an oracle."""
+    if task in FOREIGN:
+        return FOREIGN[task](task=task, **settings)
+    return EnvSettings(task=task, oracle=oracle, **settings)
