@@ -25,6 +25,7 @@ from lerobot_symview.datasets.features import Features, is_depth_feature
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.state_reader import StateOrigin
 from lerobot_symview.geometry.visibility import MILLIMETRE, MINIMUM_VISIBLE, table_resolution
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
@@ -83,6 +84,8 @@ class PreviewConfig:
     default that of the calibration file, else the dataset's, else the simulator's. The gripper's x and y are relative
     to its centre.
     """
+    state_origin: StateOrigin | None = None
+    """What the positions in the state count from: workspace, world or base; as for symview-add-views."""
     check: bool = False
     """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
     the camera as it stands in the last of them."""
@@ -232,7 +235,7 @@ def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader |
     read_for = [*views.values()]
     if config.rerun and is_depth_feature(source.features.get(keys.depth(config.camera), {})):
         read_for.append(ReprojectedView(clip="none"))  # a recording has the point cloud even if no view needs it
-    reader = FrameReader(source, config.camera, workspace, read_for, calibration)
+    reader = FrameReader(source, config.camera, workspace, read_for, calibration, state_origin=config.state_origin)
     with flagged(f"--camera={config.camera}, --calibration"):
         reader.check()
         reader = with_depth_units(reader, unit_from_flag(config.depth_unit))

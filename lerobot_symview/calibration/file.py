@@ -4,12 +4,18 @@ Matrices and lenses are rounded to float32, the precision of datasets, so that v
 file and of a dataset are bit-identical. In place of `world_from_cam` the file may have its inverse,
 `cam_from_world`, or `position` and `quaternion_xyzw` of the camera in the world.
 
+With `robot_base`, everything is moved to the base's axes, with the origin on the table below it: cameras and
+workspace then fit states and actions that are in the frame of the base.
+
 The file is YAML or JSON:
 
     units: m                        # of the translations, m or mm; K is in pixels
     workspace:                      # the square on the table that views show, metres; optional
       center: [0.45, 0.0]
       size: 0.4
+    robot_base:                     # pose of the robot's base in the world, for states that count from it; optional
+      position: [0.1, -0.3, 0.02]
+      yaw_deg: 90                   # about the vertical
     cameras:
       front:                        # as in observation.images.front
         height: 480
@@ -34,7 +40,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -57,11 +63,13 @@ ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with
 
 @dataclass(frozen=True)
 class Calibration:
-    """Fixed cameras by name; the workspace, and the depth units in metres per unit, that the file declares."""
+    """Fixed cameras by name; the workspace, the depth units in metres per unit, and the robot's base, if declared."""
 
     cameras: dict[str, Camera]
     workspace: Workspace | None = None
     depth_units: dict[str, float] = field(default_factory=dict)
+    base_height: float = 0.0
+    """Height of the robot's base above the table, metres; the world's origin is below it."""
 
     def camera(self, name: str) -> Camera:
         """Return the camera `name`.
@@ -82,7 +90,7 @@ def parse_calibration(content: Any) -> Calibration:
     """
     if not isinstance(content, Mapping):
         raise CalibrationError(f"expected a mapping with units and cameras, got {type(content).__name__}")
-    problems = _unknown_keys("the file", content, ("units", "workspace", "cameras"))
+    problems = _unknown_keys("the file", content, ("units", "workspace", "robot_base", "cameras"))
     units = content.get("units")
     if not isinstance(units, str) or units not in METRES:
         problems.append(f"units must be m or mm, got {units!r}")
@@ -104,9 +112,48 @@ def parse_calibration(content: Any) -> Calibration:
             workspace = parse_workspace(content["workspace"])
         except CalibrationError as error:
             problems.append(f"workspace: {error}")
+    world_from_base = np.eye(4)
+    if content.get("robot_base") is not None:
+        try:
+            world_from_base = _base_pose(content["robot_base"], metres)
+        except ValueError as error:
+            problems.append(f"robot_base: {error}")
     if problems:
         raise CalibrationError("; ".join(problems))
-    return Calibration(cameras, workspace, depth_units)
+    return _in_base_axes(Calibration(cameras, workspace, depth_units), world_from_base)
+
+
+def _base_pose(entries: Any, metres: float) -> Array:
+    """Return world_from_base (4, 4) of an upright base, metres."""
+    if not isinstance(entries, Mapping) or set(entries) - {"position", "yaw_deg"}:
+        raise CalibrationError(f"expected a mapping with position and yaw_deg, got {entries!r}")
+    position = _numbers("position", entries.get("position", [0, 0, 0]), (3,), "three numbers x, y, z")
+    (yaw,) = np.deg2rad(_numbers("yaw_deg", entries.get("yaw_deg", 0.0), (1,), "a number of degrees"))
+    if not np.isfinite([*position, yaw]).all():
+        raise CalibrationError(f"position and yaw_deg must be finite, got {entries!r}")
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = position * metres
+    return pose
+
+
+def _in_base_axes(calibration: Calibration, world_from_base: Array) -> Calibration:
+    """Return the calibration in a world with the base's axes, whose origin is on the table below the base."""
+    if np.array_equal(world_from_base, np.eye(4)):
+        return calibration
+    below_base = world_from_base.copy()
+    below_base[2, 3] = 0.0
+    moved = invert_rigid(below_base)
+    cameras = {
+        name: replace(camera, world_from_cam=_as_float32(moved @ camera.world_from_cam))
+        for name, camera in calibration.cameras.items()
+    }
+    workspace = calibration.workspace
+    if workspace is not None:
+        x, y, _ = moved[:3, :3] @ [*workspace.center, 0.0] + moved[:3, 3]
+        workspace = replace(workspace, center=(round(float(x), 9), round(float(y), 9)))
+    height = float(world_from_base[2, 3])
+    return replace(calibration, cameras=cameras, workspace=workspace, base_height=height)
 
 
 def parse_workspace(entries: Any) -> Workspace:
@@ -143,6 +190,8 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
         for name, camera in calibration.cameras.items()
     }
     content: dict[str, Any] = {"units": "m", "cameras": cameras}
+    if calibration.base_height:
+        content["robot_base"] = {"position": [0.0, 0.0, calibration.base_height]}
     if calibration.workspace is not None:
         content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}
     return content

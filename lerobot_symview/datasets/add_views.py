@@ -31,6 +31,7 @@ from lerobot_symview.datasets.features import (
     calibration_features,
     gripper_dimensions,
     image_size,
+    names_of,
     stored_workspace,
     view_features,
 )
@@ -39,6 +40,7 @@ from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.geometry.gripper_state import REQUIRED
+from lerobot_symview.geometry.state_reader import StateOrigin, StateReader
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -101,6 +103,10 @@ class AddViewsConfig:
     """Square on the table that the views show, such as `--workspace.center='[0.5, 0.1]' --workspace.size=0.5`; by
     default that of the calibration file, else of the dataset, else of the simulator. The gripper's x and y are relative
     to its centre."""
+    state_origin: StateOrigin | None = None
+    """What the positions in the state count from: the workspace's centre (workspace), the world, or the robot's base
+    (base), whose pose is `robot_base` in the calibration file; by default base for LeRobot's ee.x, …, else workspace.
+    """
     keep: list[str] | None = None
     """Source image keys to keep, without `observation.images.`; by default all. `[]` keeps none."""
     for_stock_policies: bool = False
@@ -193,7 +199,9 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         config.calibration, config.workspace, source.features, config.camera, config.pose
     )
     views = views_for_dataset(config.make_views(), source.features)
-    reader = FrameReader(source, config.camera, workspace, views.values(), calibration)
+    reader = FrameReader(
+        source, config.camera, workspace, views.values(), calibration, state_origin=config.state_origin
+    )
     added: Features = {}
     with flagged(f"--calibration={_listed(config.calibration)}"):
         for name, camera in reader.given_cameras().items():
@@ -222,6 +230,7 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         workspace,
         calibration,
         dict(reader.depth_units),
+        config.state_origin,
         dropped,
         added,
         derived_schema(source, dropped, added),
@@ -271,10 +280,12 @@ def unit_from_flag(depth_unit: str | None) -> float | None:
 def views_for_dataset(views: dict[str, View], features: Features) -> dict[str, View]:
     """Return the views, without clipping and gripper image if the dataset lacks the gripper's state."""
     using = [name for name, view in views.items() if view.uses_gripper]
-    if not using or gripper_dimensions(features) is not None:
+    names = StateReader(tuple(names_of(features, keys.STATE))).read_names
+    if not using or gripper_dimensions(features, names) is not None:
         return views
     logger.warning(
-        "%s has no dimensions named %s: %s are rendered without clipping at the gripper and without a gripper image",
+        "%s has no dimensions named %s (or LeRobot's ee.x, …): "
+        "%s are rendered without clipping at the gripper and without a gripper image",
         keys.STATE,
         ", ".join(REQUIRED),
         ", ".join(using),
@@ -315,6 +326,7 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "workspace": asdict(derivation.workspace),
             "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
             "depth_units": derivation.depth_units,
+            "state_origin": derivation.state_origin,
             "left_out": derivation.dropped,
             "symview": version("lerobot_policy_symview"),
         }

@@ -31,6 +31,7 @@ from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
 from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
+from lerobot_symview.geometry.state_reader import StateOrigin
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of
 from lerobot_symview.views import View
@@ -58,6 +59,8 @@ class Derivation:
     """Calibration of the cameras that is not in the source; it is added to the result."""
     depth_units: dict[str, float]
     """Camera -> metres per unit of its depth; others as the source declares."""
+    state_origin: StateOrigin | None
+    """What the state's positions count from; None for the default of its names."""
     dropped: list[str]
     """Keys of the source features that are not copied."""
     added: Features
@@ -76,7 +79,8 @@ class Derivation:
 
     def reader(self, source: SourceDataset) -> FrameReader:
         """Return a reader of the frames that the views are rendered from."""
-        return FrameReader(source, self.camera, self.workspace, self.views.values(), self.calibration, self.depth_units)
+        views, calibration = self.views.values(), self.calibration
+        return FrameReader(source, self.camera, self.workspace, views, calibration, self.depth_units, self.state_origin)
 
     def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
         """Return `rgb` or `height` for every new image feature."""

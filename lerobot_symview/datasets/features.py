@@ -143,8 +143,18 @@ def is_depth_feature(feature: dict[str, Any]) -> bool:
     return bool((feature.get("info") or {}).get("is_depth_map"))
 
 
-def gripper_dimensions(features: Features) -> list[int | None] | None:
-    """Return where the state has the gripper's pose, as `gripper_columns` does; None if it is unknown."""
-    state, action = (features.get(key, {}).get("names") for key in (keys.STATE, keys.ACTION))
-    turns = isinstance(action, list) and bool({"dyaw", "yaw"} & set(map(str, action)))
-    return gripper_columns(state, turns) if isinstance(state, list) else None
+def names_of(features: Features, key: str) -> list[str]:
+    """Return the names of a vector's dimensions; empty if the dataset does not name them."""
+    names = features.get(key, {}).get("names")
+    return names if isinstance(names, list) and all(isinstance(name, str) for name in names) else []
+
+
+def gripper_dimensions(features: Features, state: Sequence[str] | None = None) -> list[int | None] | None:
+    """Return where a state has the gripper's pose, as `gripper_columns` does; None if it is unknown.
+
+    Args:
+        features: a dataset's.
+        state: names of the state's dimensions; by default the dataset's.
+    """
+    turns = bool({"dyaw", "yaw"} & set(names_of(features, keys.ACTION)))
+    return gripper_columns(names_of(features, keys.STATE) if state is None else state, turns)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature
+from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature, names_of
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
 from lerobot_symview.geometry.gripper_state import gripper_poses
+from lerobot_symview.geometry.state_reader import StateOrigin, StateReader, origin_of
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, View, other_cameras
 
@@ -33,6 +34,7 @@ class FrameReader:
         calibration: calibration of the camera, and of further ones, if it is not in the dataset.
         depth_units: camera -> metres per unit of its depth; by default what the dataset declares, or its values
             suggest.
+        state_origin: what the state's positions count from; by default as `origin_of` says.
     """
 
     dataset: SourceDataset
@@ -41,6 +43,7 @@ class FrameReader:
     views: Collection[View]
     calibration: Calibration | None = None
     depth_units: Mapping[str, float] = field(default_factory=dict)
+    state_origin: StateOrigin | None = None
 
     @property
     def others(self) -> dict[str, FrameReader]:
@@ -83,7 +86,15 @@ class FrameReader:
     @property
     def gripper(self) -> bool:
         """Whether a view uses the gripper's state and the dataset has it."""
-        return any(view.uses_gripper for view in self.views) and gripper_dimensions(self.dataset.features) is not None
+        is_used = any(view.uses_gripper for view in self.views)
+        return is_used and gripper_dimensions(self.dataset.features, self.state_reader.read_names) is not None
+
+    @property
+    def state_reader(self) -> StateReader:
+        """What reads the dataset's states."""
+        names = names_of(self.dataset.features, keys.STATE)
+        height = self.calibration.base_height if self.calibration else 0.0
+        return StateReader(tuple(names), origin_of(self.state_origin, names, self.workspace, height))
 
     def features(self) -> list[str]:
         """Return the keys of the features that `frames` requires."""
@@ -152,9 +163,10 @@ class FrameReader:
             depths = self.dataset.images(keys.depth(self.camera), episode, table, self.depth_unit)
         states: Iterator[Any] = repeat(None)
         if self.gripper:
-            pose = gripper_dimensions(self.dataset.features)
+            reader = self.state_reader
+            pose = gripper_dimensions(self.dataset.features, reader.read_names)
             assert pose is not None
-            states = iter(gripper_poses(vectors(table, keys.STATE), pose))
+            states = iter(gripper_poses(reader.read(vectors(table, keys.STATE)), pose))
         calibrations: Iterator[Any] = repeat(None)
         if self.given_camera is None:
             names = [keys.parameter(key) for key in self._calibration()]

@@ -9,6 +9,7 @@ from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfi
 from lerobot_policy_symview.encoders import register_encoder
 from lerobot_policy_symview.env_symview import FetchEnvConfig, MetaWorldEnvConfig, SymviewEnvConfig
 from lerobot_policy_symview.processor_allowlist import restrict_processor_steps
+from lerobot_policy_symview.processor_state import StateProcessorStep
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
 restrict_processor_steps()
@@ -16,6 +17,7 @@ restrict_processor_steps()
 __all__ = [
     "FetchEnvConfig",
     "MetaWorldEnvConfig",
+    "StateProcessorStep",
     "SymviewBcConfig",
     "SymviewEnvConfig",
     "SymviewSacfdConfig",

@@ -20,6 +20,7 @@ from lerobot_policy_symview.symmetry.representations import ThetaRepresentation,
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.geometry.gripper_state import gripper_columns, missing_of
+from lerobot_symview.geometry.state_reader import ORIGINS, StateOrigin, StateReader, origin_of
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
@@ -38,6 +39,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "augmentation": ("none", "d4", "so2", "o2", "group"),
     "dtype": ("float32", "bfloat16"),
     "learning_rate_decay": ("none", "cosine"),
+    "state_origin": ("None", *ORIGINS),
 }
 UNUSED_OUTPUTS = {"reproj": {"mask": False, "age": False}, "persp": {"gripper": False}}
 
@@ -105,6 +107,13 @@ class SymviewConfig(PreTrainedConfig):
     """Type of every dimension of `observation.state`, see `lerobot_policy_symview.symmetry.representations`."""
     action_symmetry: list[str] = field(default_factory=lambda: ["x", "y", "z", "yaw", "aperture"])
     """Type of every dimension of `action`."""
+    state_origin: StateOrigin | None = None
+    """What the positions in the state count from: the workspace's centre (`workspace`), the `world`, or the robot's
+    `base`; by default `base` for LeRobot's names `ee.x`, …, else `workspace`."""
+    state_names: list[str] = field(default_factory=list)
+    """Names of the state's dimensions as the robot gives it, where it is not read as it is; read from the dataset."""
+    base_height: float = 0.0
+    """Height of the robot's base above the table, metres; read from the dataset's calibration file."""
     workspace: dict[str, Any] = field(default_factory=lambda: asdict(Workspace()))
     """Constructor arguments of `Workspace`; read from the dataset."""
     calibration: dict[str, Any] = field(default_factory=dict)
@@ -156,6 +165,8 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
         if not 0 <= self.camera_augmentation <= 10:
             raise ValueError(f"--policy.camera_augmentation must lie in [0, 10], got {self.camera_augmentation}")
+        if not -1 <= self.base_height <= 1:
+            raise ValueError(f"--policy.base_height must be metres, from -1 to 1, got {self.base_height}")
         if not 0 <= self.relaxation_weight < math.inf:
             raise ValueError(f"--policy.relaxation_weight must not be negative, got {self.relaxation_weight}")
         with flagged("--policy.workspace"):
@@ -185,6 +196,13 @@ class SymviewConfig(PreTrainedConfig):
     def states(self) -> VectorRepresentation:
         """How a state's dimensions transform."""
         return VectorRepresentation(tuple(self.state_symmetry), "--policy.state_symmetry")
+
+    @property
+    def state_reader(self) -> StateReader:
+        """What reads the robot's state; `state_symmetry` is of what it reads."""
+        names = self.state_names
+        origin = origin_of(self.state_origin, names, parse_workspace(self.workspace), self.base_height)
+        return StateReader(tuple(names), origin if names else (0.0, 0.0, 0.0))
 
     @property
     def sees_points(self) -> bool:

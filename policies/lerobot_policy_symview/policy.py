@@ -39,6 +39,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.errors import DivergenceError
 
+ENDS = ("min", "max")
 logger = logging.getLogger(__name__)
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
@@ -98,7 +99,9 @@ class SymviewPolicy(PreTrainedPolicy):
         self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
         stats = dataset_stats or {}
         action = _scale(stats.get(keys.ACTION), config.actions)
-        state = self.state_input.scale(*_scale(stats.get(keys.STATE), config.states))
+        recorded = stats.get(keys.STATE)
+        ranges = recorded and {end: config.state_reader.read_range(torch.as_tensor(recorded[end])) for end in ENDS}
+        state = self.state_input.scale(*_scale(ranges, config.states))
         for name, (center, width) in {"action": action, "state": state}.items():
             self.register_buffer(f"{name}_center", center)
             self.register_buffer(f"{name}_width", width)
@@ -278,4 +281,4 @@ def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
 def _scale(stats: dict[str, Any] | None, representation: VectorRepresentation) -> tuple[Tensor, Tensor]:
     if stats is None:
         return torch.zeros(len(representation.dimensions)), torch.ones(len(representation.dimensions))
-    return representation.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ("min", "max")))
+    return representation.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ENDS))

@@ -11,6 +11,7 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.depth_reader import delivered_units
+from lerobot_policy_symview.processor_state import StateProcessorStep
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
 
@@ -21,9 +22,10 @@ def make_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's default preprocessor and postprocessor with one step added: depth in metres, and the views.
+    """Return LeRobot's default preprocessor and postprocessor with our steps added: the state, depth, and the views.
 
-    The added step converts depth to metres and renders the policy's view if an observation lacks it.
+    One reads states of other conventions, where the policy was trained with one. The other converts depth to metres and
+    renders the policy's view if an observation lacks it.
 
     Args:
         config: the policy's configuration.
@@ -35,10 +37,13 @@ def make_processors(
         ValueError: if the view uses the gripper's pose and the declared state lacks it.
     """
     steps = make_default_policy_processor_steps(config, dataset_stats)
+    reader = config.state_reader
+    read_state = [StateProcessorStep(list(reader.names), list(reader.origin))] if reader.converts else []
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,
             steps.add_batch_dim,
+            *read_state,
             steps.to_device,
             ViewsProcessorStep(
                 views=config.views_to_make,

@@ -43,6 +43,8 @@ WRONG = {
         "dtype": ("float16", "dtype.*'float16'.*bfloat16"),
         "state_symmetry": (["x"], r"--policy.state_symmetry=\['x'\] lacks y, z, yaw"),
         "action_symmetry": (["height"], r"--policy.action_symmetry has unknown types \['height'\], expected any of"),
+        "state_origin": ("table", "state_origin.*'table'.*world"),
+        "base_height": (20.0, "--policy.base_height must be metres, from -1 to 1, got 20"),
         "workspace": ({"size": -1}, "--policy.workspace: workspace size and height_limit must be positive.*got -1"),
         "calibration": ({"units": "cm"}, "--policy.calibration: units must be m or mm, got 'cm'"),
         "camera_augmentation": (11, "--policy.camera_augmentation must lie in"),
@@ -120,7 +122,7 @@ WRONG = {
     },
 }
 """Configuration -> field -> a wrong value, and what the terminal shows."""
-FREE = {"camera"}  # of the policies: any name; the dataset tells whether it has this camera
+FREE = {"camera", "state_names"}  # of the policies: any names; the dataset tells whether it has them
 DATASET = {"dataset": {"repo_id": "a/b"}}
 TOGETHER_WITH = {"view_size": {"views": ["persp"]}}
 CASES = [(kind, field, *case) for kind, cases in WRONG.items() for field, case in cases.items()]

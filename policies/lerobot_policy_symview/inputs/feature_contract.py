@@ -17,6 +17,7 @@ from lerobot_symview.datasets.features import image_size
 from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
 from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Camera, stored_camera
+from lerobot_symview.geometry.state_reader import StateReader
 from lerobot_symview.views import View, ViewSpec
 
 Features = dict[str, dict[str, Any]]
@@ -81,11 +82,18 @@ def _check_vectors(config: SymviewConfig, features: Features) -> None:
         names = features[key].get("names")
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             names = None
+        size = int(features[key]["shape"][0])
+        if kind == "state":
+            counts_from_elsewhere = config.state_origin not in (None, "workspace")
+            given = names or (list(config.state_symmetry) if counts_from_elsewhere else [])
+            read = StateReader(tuple(given)).read_names
+            config.state_names = given if read != given or counts_from_elsewhere else []
+            names, size = (read, len(read)) if names else (names, size)
         types = types_of(names or ())
         if types and getattr(config, f"{kind}_symmetry") == keys.STATE_NAMES:
             setattr(config, f"{kind}_symmetry", types)
         representation = config.states if kind == "state" else config.actions
-        representation.check(int(features[key]["shape"][0]), key, names if config.group != "C1" else None)
+        representation.check(size, key, names if config.group != "C1" else None)
     config.check()  # options that depend on the types
 
 
@@ -124,6 +132,13 @@ def _read_view(config: SymviewConfig, features: Features) -> None:
         if config.is_computed and config.missing_of_gripper:
             changed = _changed_options(config.make_view(), config.make_view().without_gripper())
             config.view = ViewSpec(config.view.name, config.view.options | changed)
+            if changed:
+                logger.info(
+                    "the state does not say where the gripper is (it lacks %s): the view %s is made with %s",
+                    config.missing_of_gripper,
+                    config.view.name,
+                    ", ".join(f"{name}={value}" for name, value in changed.items()),
+                )
 
 
 def read_calibration(config: SymviewConfig) -> None:
@@ -136,6 +151,11 @@ def read_calibration(config: SymviewConfig) -> None:
         CalibrationError: if the calibration in the dataset is invalid.
     """
     meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
+    given = _calibration_file(meta) if meta is not None else None
+    if given is None and config.calibration:
+        given = parse_calibration(config.calibration)
+    if given is not None and given.base_height:
+        config.base_height = given.base_height
     if meta is not None and (config.uses_calibration or config.check_camera):
         name = next(iter(config.substitutes(meta.features)), config.camera)
         names = {config.camera: name} | {other: other for other in config.merged_cameras}  # own -> the dataset's

@@ -7,6 +7,7 @@ import yaml
 from lerobot_symview.calibration.file import parse_calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import project
 from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace
 from tests.helpers.cameras import make_camera
@@ -38,6 +39,42 @@ def test_translations_in_millimetres_are_converted_to_metres():
     pose[:3, 3] *= 1000
     calibration = parse_calibration(content(world_from_cam=pose.tolist()) | {"units": "mm"})
     np.testing.assert_allclose(calibration.camera("front").position, make_camera().position)
+
+
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 1000.0)])
+def test_with_the_robots_base_everything_is_in_its_axes(units, scale):
+    """A point in the frame of the base projects to the same pixel; z still counts from the table."""
+    base = {"position": [scale * value for value in (0.2, -0.3, 0.05)], "yaw_deg": 90}
+    pose = make_camera(size=64).world_from_cam.copy()
+    pose[:3, 3] *= scale
+    given = content(world_from_cam=pose.tolist()) | {"units": units, "workspace": {"center": [0.45, 0.1]}}
+    plain, calibration = (parse_calibration(one) for one in (given, given | {"robot_base": base}))
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) + [0.45, 0.0, 0.1]
+    offset = points - [0.2, -0.3, 0.0]
+    in_base = np.column_stack([offset[:, 1], -offset[:, 0], offset[:, 2]])
+    pixels, _ = project(points, plain.camera("front"))
+    np.testing.assert_allclose(project(in_base, calibration.camera("front"))[0], pixels, atol=1e-4)
+    assert calibration.workspace.center == pytest.approx((0.4, -0.25))
+    assert calibration.base_height == pytest.approx(0.05)
+    again = parse_calibration(plain_calibration(calibration))
+    assert again.base_height == calibration.base_height
+    assert again.workspace == calibration.workspace
+    np.testing.assert_array_equal(again.camera("front").world_from_cam, calibration.camera("front").world_from_cam)
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ([0, 0, 0], "robot_base: expected a mapping with position and yaw_deg"),
+        ({"place": [0, 0, 0]}, "robot_base: expected a mapping with position and yaw_deg"),
+        ({"position": [0, 0]}, "robot_base: position must be three numbers"),
+        ({"yaw_deg": "left"}, "robot_base: yaw_deg must be a number"),
+        ({"position": [0, 0, np.nan]}, "robot_base: position and yaw_deg must be finite"),
+    ],
+)
+def test_an_invalid_base_is_an_error(base, message):
+    with pytest.raises(CalibrationError, match=message):
+        parse_calibration(content() | {"robot_base": base})
 
 
 @pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("mm", 1000.0)])
