@@ -15,6 +15,7 @@ from typing import NoReturn
 
 from lerobot_symview.errors import OptionError, SymviewError
 from lerobot_symview.registry import check_name
+from lerobot_symview.runtime.parse_errors import reason, unknown_flags
 
 USAGE, FAILURE, INTERRUPTED = 2, 1, 130
 PACKAGES = ("lerobot_symview", "symview_sim", "lerobot_policy_symview", "symview_eval")
@@ -94,12 +95,11 @@ def run_command[Config](
         with redirect_stderr(usage_errors):
             config = draccus.parse(config_class)
     except SystemExit as end:  # argparse printed help, or usage and then the error of an unknown flag
-        reason = usage_errors.getvalue().strip().rpartition("error: ")[2]
         if end.code:
-            _end(program, reason, USAGE)
+            _end(program, unknown_flags(usage_errors.getvalue()), USAGE)
         raise
     except Exception as error:  # draccus passes on any error of a field's type: each is an invalid flag
-        _end(program, _reasons(error), USAGE)
+        _end(program, reason(error), USAGE)
     try:
         main(config)
     except (ValueError, OptionError) as error:
@@ -139,18 +139,6 @@ def quiet() -> None:
         logging.getLogger(package).setLevel(logging.INFO)
 
 
-def _reasons(error: BaseException) -> str:
-    """Join an error's message with those of its causes: draccus names the field, the cause names the value."""
-    if isinstance(error.__cause__, OptionError):  # draccus quotes it between Python classes
-        return f"--{'.'.join(getattr(error, 'key_path', ()))}: {error.__cause__}"
-    messages = [str(error)]
-    while error.__cause__ is not None:
-        error = error.__cause__
-        if str(error) not in messages[-1]:
-            messages.append(str(error))
-    return ": ".join(message for message in messages if "Couldn't instantiate class" not in message)
-
-
-def _end(program: str, reason: str, code: int) -> NoReturn:
-    sys.stderr.write(f"{program}: error: {' '.join(reason.split())}\n")
+def _end(program: str, problem: str, code: int) -> NoReturn:
+    sys.stderr.write(f"{program}: error: {' '.join(problem.split())}\n")
     sys.exit(code)
