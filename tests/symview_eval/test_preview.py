@@ -85,11 +85,13 @@ def test_a_view_that_is_not_stored_is_computed(recorded, tmp_path):
 
 def test_warnings_about_holes_and_resolution(recorded, tmp_path, caplog):
     with caplog.at_level(logging.WARNING, logger="symview_eval.preview"):
-        preview(config(recorded, tmp_path / "coarse", frames=1))
-        assert "of the pixels of side_reproj are inferred, more than --max_holes=0.5" in caplog.text
-        assert "view reproj needs 0.38 px/mm" in caplog.text
+        preview(config(recorded, tmp_path / "coarse", frames=1, size=400))
+        assert "of the pixels of side_reproj are inferred, more than --max_holes=0.85: lower --size, or" in caplog.text
+        assert re.search(
+            r"view reproj draws 1.00 px/mm, camera side resolves 0.\d+ at worst: use --size=76", caplog.text
+        )
         caplog.clear()
-        preview(config(recorded, tmp_path / "fine", frames=1, size=40))
+        preview(config(recorded, tmp_path / "fine", frames=1))  # the paper's camera and size
         assert caplog.text == ""
 
 
