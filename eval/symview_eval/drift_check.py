@@ -156,8 +156,8 @@ def _write_moved(
         except CalibrationError as error:
             plane = f"; {error}"
     file = output_dir / "cameras.yaml"
-    height = reader.calibration.base_height if reader.calibration else 0.0
-    calibration = Calibration({reader.camera: camera}, reader.workspace, base_height=height)
+    height = reader.calibration.origin_height if reader.calibration else 0.0
+    calibration = Calibration({reader.camera: camera}, reader.workspace, origin_height=height)
     replace_file(file, yaml.safe_dump(plain_calibration(calibration), sort_keys=False, default_flow_style=None))
     logger.info(
         "wrote %s: the camera as it stands in %s, turned by %.2f degrees and shifted by %.1f mm%s",

@@ -5,7 +5,7 @@ file and of a dataset are bit-identical. In place of `world_from_cam` the file m
 `cam_from_world`, or `position` and `quaternion_xyzw` of the camera in the world.
 
 With `robot_base`, everything is moved to the base's axes, with the origin on the table below it: cameras and
-workspace then fit states and actions that are in the frame of the base.
+workspace then fit states and actions in the frame of the base. With `table_height`, the table is moved to z = 0.
 
 The file is YAML or JSON:
 
@@ -13,6 +13,7 @@ The file is YAML or JSON:
     workspace:                      # the square on the table that views show, metres; optional
       center: [0.45, 0.0]
       size: 0.4
+      table_height: 0.0             # of the table in the world, metres; optional
     robot_base:                     # pose of the robot's base in the world, for states that count from it; optional
       position: [0.1, -0.3, 0.02]
       yaw_deg: 90                   # about the vertical
@@ -68,8 +69,8 @@ class Calibration:
     cameras: dict[str, Camera]
     workspace: Workspace | None = None
     depth_units: dict[str, float] = field(default_factory=dict)
-    base_height: float = 0.0
-    """Height of the robot's base above the table, metres; the world's origin is below it."""
+    origin_height: float = 0.0
+    """Height above the table of the origin that states count from, the file's world or the robot's base, metres."""
 
     def camera(self, name: str) -> Camera:
         """Return the camera `name`.
@@ -107,9 +108,11 @@ def parse_calibration(content: Any) -> Calibration:
                 depth_units[str(name)] = parse_unit(entries["depth_unit"])
         except ValueError as error:
             problems.append(f"camera {name!r}: {error}")
+    table_height = 0.0
     if content.get("workspace") is not None:
         try:
-            workspace = parse_workspace(content["workspace"])
+            entries, table_height = _without_table_height(content["workspace"])
+            workspace = parse_workspace(entries)
         except CalibrationError as error:
             problems.append(f"workspace: {error}")
     world_from_base = np.eye(4)
@@ -120,7 +123,17 @@ def parse_calibration(content: Any) -> Calibration:
             problems.append(f"robot_base: {error}")
     if problems:
         raise CalibrationError("; ".join(problems))
-    return _in_base_axes(Calibration(cameras, workspace, depth_units), world_from_base)
+    return _on_table(Calibration(cameras, workspace, depth_units), world_from_base, table_height)
+
+
+def _without_table_height(entries: Any) -> tuple[Any, float]:
+    """Return the entries of `Workspace`, and the table's height in the world, metres."""
+    if not isinstance(entries, Mapping) or "table_height" not in entries:
+        return entries, 0.0
+    (height,) = _numbers("table_height", entries["table_height"], (1,), "a number of metres")
+    if not np.isfinite(height):
+        raise CalibrationError(f"table_height must be finite, got {height}")
+    return {name: value for name, value in entries.items() if name != "table_height"}, float(height)
 
 
 def _base_pose(entries: Any, metres: float) -> Array:
@@ -137,12 +150,12 @@ def _base_pose(entries: Any, metres: float) -> Array:
     return pose
 
 
-def _in_base_axes(calibration: Calibration, world_from_base: Array) -> Calibration:
+def _on_table(calibration: Calibration, world_from_base: Array, table_height: float) -> Calibration:
     """Return the calibration in a world with the base's axes, whose origin is on the table below the base."""
-    if np.array_equal(world_from_base, np.eye(4)):
+    if np.array_equal(world_from_base, np.eye(4)) and table_height == 0:
         return calibration
     below_base = world_from_base.copy()
-    below_base[2, 3] = 0.0
+    below_base[2, 3] = table_height
     moved = invert_rigid(below_base)
     cameras = {
         name: replace(camera, world_from_cam=_as_float32(moved @ camera.world_from_cam))
@@ -152,8 +165,8 @@ def _in_base_axes(calibration: Calibration, world_from_base: Array) -> Calibrati
     if workspace is not None:
         x, y, _ = moved[:3, :3] @ [*workspace.center, 0.0] + moved[:3, 3]
         workspace = replace(workspace, center=(round(float(x), 9), round(float(y), 9)))
-    height = float(world_from_base[2, 3])
-    return replace(calibration, cameras=cameras, workspace=workspace, base_height=height)
+    height = float(world_from_base[2, 3]) - table_height
+    return replace(calibration, cameras=cameras, workspace=workspace, origin_height=height)
 
 
 def parse_workspace(entries: Any) -> Workspace:
@@ -190,8 +203,8 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
         for name, camera in calibration.cameras.items()
     }
     content: dict[str, Any] = {"units": "m", "cameras": cameras}
-    if calibration.base_height:
-        content["robot_base"] = {"position": [0.0, 0.0, calibration.base_height]}
+    if calibration.origin_height:
+        content["robot_base"] = {"position": [0.0, 0.0, calibration.origin_height]}
     if calibration.workspace is not None:
         content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}
     return content

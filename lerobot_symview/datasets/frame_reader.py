@@ -93,7 +93,7 @@ class FrameReader:
     def state_reader(self) -> StateReader:
         """What reads the dataset's states."""
         names = names_of(self.dataset.features, keys.STATE)
-        height = self.calibration.base_height if self.calibration else 0.0
+        height = self.calibration.origin_height if self.calibration else 0.0
         return StateReader(tuple(names), origin_of(self.state_origin, names, self.workspace, height))
 
     def features(self) -> list[str]:

@@ -24,7 +24,7 @@ def is_end_effector(names: Sequence[str]) -> bool:
 
 
 def origin_of(
-    kind: StateOrigin | None, names: Sequence[str], workspace: Workspace, base_height: float = 0.0
+    kind: StateOrigin | None, names: Sequence[str], workspace: Workspace, origin_height: float = 0.0
 ) -> tuple[float, float, float]:
     """Return the workspace's centre on the table in the frame in which a state's positions are given, metres.
 
@@ -33,12 +33,12 @@ def origin_of(
             workspace's centre.
         names: of the state's dimensions.
         workspace: the square on the table.
-        base_height: of the robot's base above the table, metres. Its x and y are the world's origin.
+        origin_height: height above the table of what positions count from, metres.
     """
     kind = kind or ("base" if is_end_effector(names) else "workspace")
     if kind == "workspace":
         return (0.0, 0.0, 0.0)
-    return (*workspace.center, -base_height if kind == "base" else 0.0)
+    return (*workspace.center, -origin_height)
 
 
 @dataclass(frozen=True)

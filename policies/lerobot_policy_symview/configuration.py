@@ -112,8 +112,8 @@ class SymviewConfig(PreTrainedConfig):
     `base`; by default `base` for LeRobot's names `ee.x`, …, else `workspace`."""
     state_names: list[str] = field(default_factory=list)
     """Names of the state's dimensions as the robot gives it, where it is not read as it is; read from the dataset."""
-    base_height: float = 0.0
-    """Height of the robot's base above the table, metres; read from the dataset's calibration file."""
+    origin_height: float = 0.0
+    """Height above the table of what positions count from, metres; read from the dataset's calibration file."""
     workspace: dict[str, Any] = field(default_factory=lambda: asdict(Workspace()))
     """Constructor arguments of `Workspace`; read from the dataset."""
     calibration: dict[str, Any] = field(default_factory=dict)
@@ -165,8 +165,8 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
         if not 0 <= self.camera_augmentation <= 10:
             raise ValueError(f"--policy.camera_augmentation must lie in [0, 10], got {self.camera_augmentation}")
-        if not -1 <= self.base_height <= 1:
-            raise ValueError(f"--policy.base_height must be metres, from -1 to 1, got {self.base_height}")
+        if not -1 <= self.origin_height <= 1:
+            raise ValueError(f"--policy.origin_height must be metres, from -1 to 1, got {self.origin_height}")
         if not 0 <= self.relaxation_weight < math.inf:
             raise ValueError(f"--policy.relaxation_weight must not be negative, got {self.relaxation_weight}")
         with flagged("--policy.workspace"):
@@ -201,7 +201,7 @@ class SymviewConfig(PreTrainedConfig):
     def state_reader(self) -> StateReader:
         """What reads the robot's state; `state_symmetry` is of what it reads."""
         names = self.state_names
-        origin = origin_of(self.state_origin, names, parse_workspace(self.workspace), self.base_height)
+        origin = origin_of(self.state_origin, names, parse_workspace(self.workspace), self.origin_height)
         return StateReader(tuple(names), origin if names else (0.0, 0.0, 0.0))
 
     @property

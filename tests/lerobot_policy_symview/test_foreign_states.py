@@ -94,7 +94,7 @@ def test_a_policy_reads_the_state_in_training_and_on_the_robot(robot, tmp_path, 
     policy = SymviewBcPolicy.from_pretrained(checkpoint)
     preprocessor, _ = make_pre_post_processors(policy.config, pretrained_path=str(checkpoint))
     assert policy.config.state_names == list(END_EFFECTOR)
-    assert policy.config.base_height == pytest.approx(0.03)
+    assert policy.config.origin_height == pytest.approx(0.03)
     for index in (0, length - 1):
         item = source[index]
         observed = {key: item[key] for key in (keys.rgb("side"), keys.depth("side"))}

@@ -154,8 +154,8 @@ def read_calibration(config: SymviewConfig) -> None:
     given = _calibration_file(meta) if meta is not None else None
     if given is None and config.calibration:
         given = parse_calibration(config.calibration)
-    if given is not None and given.base_height:
-        config.base_height = given.base_height
+    if given is not None and given.origin_height:
+        config.origin_height = given.origin_height
     if meta is not None and (config.uses_calibration or config.check_camera):
         name = next(iter(config.substitutes(meta.features)), config.camera)
         names = {config.camera: name} | {other: other for other in config.merged_cameras}  # own -> the dataset's

@@ -55,11 +55,26 @@ def test_with_the_robots_base_everything_is_in_its_axes(units, scale):
     pixels, _ = project(points, plain.camera("front"))
     np.testing.assert_allclose(project(in_base, calibration.camera("front"))[0], pixels, atol=1e-4)
     assert calibration.workspace.center == pytest.approx((0.4, -0.25))
-    assert calibration.base_height == pytest.approx(0.05)
+    assert calibration.origin_height == pytest.approx(0.05)
     again = parse_calibration(plain_calibration(calibration))
-    assert again.base_height == calibration.base_height
+    assert again.origin_height == calibration.origin_height
     assert again.workspace == calibration.workspace
     np.testing.assert_array_equal(again.camera("front").world_from_cam, calibration.camera("front").world_from_cam)
+
+
+@pytest.mark.parametrize("base", [None, {"position": [0.0, 0.0, 0.9]}])
+def test_a_table_at_another_height_is_at_z_0(base):
+    raised = make_camera(size=64).world_from_cam.copy()
+    raised[2, 3] += 0.8
+    given = content(world_from_cam=raised.tolist()) | {"workspace": {"center": [0.45, 0.1], "table_height": 0.8}}
+    calibration = parse_calibration(given | ({"robot_base": base} if base else {}))
+    np.testing.assert_allclose(calibration.camera("front").world_from_cam, make_camera().world_from_cam, atol=1e-6)
+    assert calibration.workspace == Workspace((0.45, 0.1))
+    assert calibration.origin_height == pytest.approx(0.1 if base else -0.8)
+    again = parse_calibration(plain_calibration(calibration))
+    assert again.origin_height == calibration.origin_height
+    with pytest.raises(CalibrationError, match="workspace: table_height must be a number of metres"):
+        parse_calibration(content() | {"workspace": {"table_height": "low"}})
 
 
 @pytest.mark.parametrize(

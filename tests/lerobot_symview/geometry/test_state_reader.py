@@ -23,7 +23,7 @@ def test_an_end_effectors_pose_is_read_as_ours():
     rng = np.random.default_rng(0)
     yaw = rng.uniform(-3, 3, 50)
     names, states, position = end_effector(yaw, rng, 50)
-    reader = StateReader(names, origin_of(None, names, WORKSPACE, base_height=0.02))
+    reader = StateReader(names, origin_of(None, names, WORKSPACE, origin_height=0.02))
     read = reader.read(states)
     assert reader.converts
     assert reader.read_names == [*OURS, "force", "time"]
@@ -55,13 +55,13 @@ def test_numpy_and_torch_read_the_same_bits():
     [
         (None, OURS, (0.0, 0.0, 0.0)),
         ("workspace", END_EFFECTOR, (0.0, 0.0, 0.0)),
-        ("world", OURS, (0.3, -0.1, 0.0)),
+        ("world", OURS, (0.3, -0.1, -0.05)),
         ("base", OURS, (0.3, -0.1, -0.05)),
         (None, END_EFFECTOR, (0.3, -0.1, -0.05)),
     ],
 )
 def test_positions_count_from_the_stated_origin(kind, names, origin):
-    assert origin_of(kind, names, WORKSPACE, base_height=0.05) == pytest.approx(origin)
+    assert origin_of(kind, names, WORKSPACE, origin_height=0.05) == pytest.approx(origin)
     reader = StateReader(("z", "y", "x", "force"), origin)
     read = reader.read(np.array([[1.0, 2.0, 3.0, 4.0]]))
     np.testing.assert_allclose(read, [[1 - origin[2], 2 - origin[1], 3 - origin[0], 4.0]])
