@@ -127,6 +127,22 @@ def check_pybullet() -> Finding:
     return Finding("pybullet was built without numpy support: rendering is slower", advice=REBUILD)
 
 
+def check_mujoco() -> Finding:
+    """Meta-World and FetchPush need MuJoCo, and a way to draw without a screen."""
+    if not is_installed("mujoco"):
+        advice = "pip install 'lerobot_policy_symview[metaworld,fetch]'"
+        return Finding("mujoco is not installed (optional, for Meta-World and FetchPush)", advice=advice)
+    import mujoco
+
+    from symview_sim.worlds.rendering import REMEDY, MujocoRenderer
+
+    try:
+        MujocoRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except CommandError as error:
+        return Finding(str(error).partition(";")[0], REMEDY)
+    return Finding(f"MuJoCo {mujoco.__version__} draws without a screen")
+
+
 def is_installed(name: str) -> bool:
     """Whether a distribution is installed."""
     try:
@@ -144,6 +160,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     check_escnn,
     check_opencv,
     check_pybullet,
+    check_mujoco,
 )
 
 

@@ -26,7 +26,15 @@ def test_a_pybullet_without_numpy_works_and_can_be_rebuilt(monkeypatch):
     assert "--no-build-isolation" in finding.advice
 
 
-@pytest.mark.parametrize("name", ["escnn", "pybullet"])
+def test_a_mujoco_that_cannot_draw_is_found(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setattr("mujoco.egl.GLContext", lambda width, height: 1 / 0)
+    finding = doctor.check_mujoco()
+    assert finding.text == "MuJoCo cannot draw without a screen by egl: division by zero"
+    assert "libegl1" in finding.remedy
+
+
+@pytest.mark.parametrize("name", ["escnn", "pybullet", "mujoco"])
 def test_absent_optional_packages_are_no_failure(monkeypatch, capsys, name):
     monkeypatch.setattr(doctor, "is_installed", lambda package: package != name)
     check = getattr(doctor, f"check_{name}")

@@ -6,6 +6,7 @@ import io
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.settings import needs_extra
 from symview_sim.worlds.base import MujocoSettings, MujocoWorld, turned
+
+if TYPE_CHECKING:
+    from symview_sim.worlds.env import MujocoEnv
 
 TASK = "FetchPush"
 UNIT = 0.05  # metres of the gripper for an action of 1
@@ -65,23 +69,33 @@ class FetchSettings(MujocoSettings):
         """(4, 4): the model's table is 0.4 m high, and its robot stands at x = 0.405, y = 0.75."""
         return turned(0.0, (-0.405, -0.75, -TABLE))
 
-    def make_world(self) -> FetchPush:
-        """Return the task.
+    def make(self) -> MujocoEnv:
+        """Return a new environment.
 
         Raises:
             ModuleNotFoundError: if Gymnasium-Robotics is not installed; the message names the extra.
         """
+        _push_env()
+        return super().make()
+
+    def make_world(self) -> FetchPush:
+        """Return the task."""
         return FetchPush()
+
+
+def _push_env() -> Any:
+    """Return the class of the environment."""
+    advice = io.StringIO()  # on environments that are not used here
+    with needs_extra("gymnasium_robotics", "fetch", "FetchPush's tasks"), redirect_stderr(advice):
+        from gymnasium_robotics.envs.fetch.push import MujocoFetchPushEnv
+    return MujocoFetchPushEnv
 
 
 class FetchPush(MujocoWorld):
     """FetchPush, with an expert of ours: it has none."""
 
     def __init__(self) -> None:
-        advice = io.StringIO()  # on environments that are not used here
-        with needs_extra("gymnasium_robotics", "fetch", "FetchPush's tasks"), redirect_stderr(advice):
-            from gymnasium_robotics.envs.fetch.push import MujocoFetchPushEnv
-        self._env = MujocoFetchPushEnv()
+        self._env = _push_env()()
         self.model, self.data = self._env.model, self._env.data
         is_target = self.model.body_mocapid[self.model.geom_bodyid] >= 0
         self.model.geom_rgba[is_target, 3] = 0.0  # a cross, metres wide, where the gripper is to go
