@@ -143,11 +143,9 @@ def _around_gripper(name: str, label: str, **policy: Any) -> MethodRow:
 
 
 FOREIGN = (
-    in_foreign_world(_around_gripper("reproj_equi_around", "Reproj. Equi, clipped around the gripper")),
+    in_foreign_world(_around_gripper("reproj_equi_around", "Reproj. Equi, clip radius")),
     in_foreign_world(REPROJ),
-    in_foreign_world(
-        _around_gripper("reproj_nonequi_around", "Reproj. NonEqui, clipped around the gripper", encoder="plain")
-    ),
+    in_foreign_world(_around_gripper("reproj_nonequi_around", "Reproj. NonEqui, clip radius", encoder="plain")),
     in_foreign_world(PERSP),
     in_foreign_world(SIDE),
     in_foreign_world(PLAIN),
