@@ -132,11 +132,14 @@ def check_mujoco() -> Finding:
     if not is_installed("mujoco"):
         advice = "pip install 'lerobot_policy_symview[metaworld,fetch]'"
         return Finding("mujoco is not installed (optional, for Meta-World and FetchPush)", advice=advice)
-    import mujoco
-
-    from symview_sim.worlds.rendering import REMEDY, MujocoRenderer
+    from symview_sim.worlds.base import REMEDY, check_mujoco_import
 
     try:
+        check_mujoco_import()
+        import mujoco
+
+        from symview_sim.worlds.rendering import MujocoRenderer
+
         MujocoRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
     except CommandError as error:
         return Finding(str(error).partition(";")[0], REMEDY)

@@ -48,7 +48,9 @@ import numpy as np
 
 from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Array, Camera, DepthSensor, invert_rigid
+from lerobot_symview.geometry.gripper_state import REQUIRED as REQUIRED_POSITION
 from lerobot_symview.geometry.lens import Lens, lens_from_coefficients
+from lerobot_symview.geometry.state_reader import StateOrigin
 from lerobot_symview.geometry.units import parse_unit
 from lerobot_symview.geometry.workspace import Workspace
 
@@ -59,6 +61,7 @@ REQUIRED = ("height", "width", "intrinsics")
 POSES = ("world_from_cam", "cam_from_world", "position")
 OPTIONAL = ("quaternion_xyzw", "depth_unit", "distortion", "distortion_model", "depth_sensor")
 SENSOR_POSES = ("color_from_depth", "position")
+HIGHEST = 3.0  # metres of a robot's base above the table, or below it
 ROUNDED = 0.01  # largest deviation from a rotation, as of a matrix printed with two decimals
 
 
@@ -71,6 +74,8 @@ class Calibration:
     depth_units: dict[str, float] = field(default_factory=dict)
     origin_height: float = 0.0
     """Height above the table of the origin that states count from, the file's world or the robot's base, metres."""
+    is_in_base_axes: bool = False
+    """Whether the file has `robot_base`, so that cameras and workspace are in the axes of the base."""
 
     def camera(self, name: str) -> Camera:
         """Return the camera `name`.
@@ -112,18 +117,21 @@ def parse_calibration(content: Any) -> Calibration:
     if content.get("workspace") is not None:
         try:
             entries, table_height = _without_table_height(content["workspace"])
-            workspace = parse_workspace(entries)
+            workspace = None if entries == {} else parse_workspace(entries)
         except CalibrationError as error:
             problems.append(f"workspace: {error}")
-    world_from_base = np.eye(4)
-    if content.get("robot_base") is not None:
+    world_from_base, has_base = np.eye(4), content.get("robot_base") is not None
+    if has_base:
         try:
             world_from_base = _base_pose(content["robot_base"], metres)
         except ValueError as error:
             problems.append(f"robot_base: {error}")
+    if not abs(world_from_base[2, 3] - table_height) <= HIGHEST:
+        problems.append(f"robot_base and table_height must be less than {HIGHEST:g} m apart")
     if problems:
         raise CalibrationError("; ".join(problems))
-    return _on_table(Calibration(cameras, workspace, depth_units), world_from_base, table_height)
+    found = Calibration(cameras, workspace, depth_units, is_in_base_axes=has_base)
+    return _on_table(found, world_from_base, table_height)
 
 
 def _without_table_height(entries: Any) -> tuple[Any, float]:
@@ -134,6 +142,22 @@ def _without_table_height(entries: Any) -> tuple[Any, float]:
     if not np.isfinite(height):
         raise CalibrationError(f"table_height must be finite, got {height}")
     return {name: value for name, value in entries.items() if name != "table_height"}, float(height)
+
+
+def check_origin(calibration: Calibration, kind: StateOrigin | None, names: Sequence[str]) -> None:
+    """Raise a CalibrationError if a file with `robot_base` is used for states that do not count from the base.
+
+    Args:
+        calibration: of the file.
+        kind: what positions count from; None for the default of their names.
+        names: of the state's dimensions.
+    """
+    has_position = set(REQUIRED_POSITION) <= set(names)
+    if calibration.is_in_base_axes and (kind in ("world", "workspace") or (kind is None and has_position)):
+        raise CalibrationError(
+            f"robot_base moves the cameras to the axes of the base, but the state's positions count from the "
+            f"{kind or 'workspace'}: state_origin must be base, or leave robot_base out"
+        )
 
 
 def _base_pose(entries: Any, metres: float) -> Array:
@@ -203,7 +227,7 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
         for name, camera in calibration.cameras.items()
     }
     content: dict[str, Any] = {"units": "m", "cameras": cameras}
-    if calibration.origin_height:
+    if calibration.origin_height or calibration.is_in_base_axes:
         content["robot_base"] = {"position": [0.0, 0.0, calibration.origin_height]}
     if calibration.workspace is not None:
         content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lerobot_symview.views import View
 
 Features = dict[str, dict[str, Any]]
+TURNING = ("yaw", "rx", "ry", "rz", "wx", "wy", "wz", "roll", "pitch")  # names of what turns a gripper
 IMAGE_AXES = ["height", "width", "channels"]
 
 
@@ -156,5 +157,5 @@ def gripper_dimensions(features: Features, state: Sequence[str] | None = None) -
         features: a dataset's.
         state: names of the state's dimensions; by default the dataset's.
     """
-    turns = bool({"dyaw", "yaw"} & set(names_of(features, keys.ACTION)))
+    turns = any(name.removeprefix("ee.").removeprefix("d") in TURNING for name in names_of(features, keys.ACTION))
     return gripper_columns(names_of(features, keys.STATE) if state is None else state, turns)

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import Calibration
+from lerobot_symview.calibration.file import Calibration, check_origin
 from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature, names_of
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
@@ -93,6 +93,8 @@ class FrameReader:
     def state_reader(self) -> StateReader:
         """What reads the dataset's states."""
         names = names_of(self.dataset.features, keys.STATE)
+        if self.calibration is not None:
+            check_origin(self.calibration, self.state_origin, names)
         height = self.calibration.origin_height if self.calibration else 0.0
         return StateReader(tuple(names), origin_of(self.state_origin, names, self.workspace, height))
 

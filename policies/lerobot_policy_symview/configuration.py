@@ -165,8 +165,8 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
         if not 0 <= self.camera_augmentation <= 10:
             raise ValueError(f"--policy.camera_augmentation must lie in [0, 10], got {self.camera_augmentation}")
-        if not -1 <= self.origin_height <= 1:
-            raise ValueError(f"--policy.origin_height must be metres, from -1 to 1, got {self.origin_height}")
+        if not -3 <= self.origin_height <= 3:
+            raise ValueError(f"--policy.origin_height must be metres, from -3 to 3, got {self.origin_height}")
         if not 0 <= self.relaxation_weight < math.inf:
             raise ValueError(f"--policy.relaxation_weight must not be negative, got {self.relaxation_weight}")
         with flagged("--policy.workspace"):
@@ -273,8 +273,8 @@ class SymviewConfig(PreTrainedConfig):
 
     @property
     def gripper_turns(self) -> bool:
-        """Whether actions turn the gripper about the vertical."""
-        return bool(self.actions.of_type("yaw"))
+        """Whether actions turn the gripper."""
+        return bool(self.actions.of_type("yaw") or self.actions.of_type("rx"))
 
     @property
     def missing_of_gripper(self) -> str:

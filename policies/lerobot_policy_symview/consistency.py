@@ -58,9 +58,10 @@ def check_combination(config: SymviewConfig) -> None:
             f"--policy.view=side and --policy.encoder=plain, got {config.view.name} and {config.encoder}"
         )
     if config.gripper_input == "image" and config.missing_of_gripper:
+        turning = f", and --policy.action_symmetry={config.action_symmetry} turns it" if config.gripper_turns else ""
         raise ValueError(
             f"--policy.gripper_input=image draws the gripper; --policy.state_symmetry={config.state_symmetry} lacks "
-            f"{config.missing_of_gripper}: use --policy.gripper_input=vector"
+            f"{config.missing_of_gripper}{turning}: use --policy.gripper_input=vector"
         )
     if config.augmentation != "none":
         _check_augmentation(config)

@@ -83,6 +83,8 @@ class WorldEnvConfig(WorldSettings, EnvConfig):
             **{key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in shapes.items()},
         }
         self.features_map = {key: key for key in self.features}
+        if self.fps not in (0, self.actions_per_second):
+            raise FlagError(f"--env.fps={self.fps}: the simulator takes {self.actions_per_second} actions a second")
         self.fps = self.actions_per_second
 
     def _make_views(self) -> dict[str, View]:

@@ -44,7 +44,7 @@ WRONG = {
         "state_symmetry": (["x"], r"--policy.state_symmetry=\['x'\] lacks y, z, yaw"),
         "action_symmetry": (["height"], r"--policy.action_symmetry has unknown types \['height'\], expected any of"),
         "state_origin": ("table", "state_origin.*'table'.*world"),
-        "origin_height": (20.0, "--policy.origin_height must be metres, from -1 to 1, got 20"),
+        "origin_height": (20.0, "--policy.origin_height must be metres, from -3 to 3, got 20"),
         "workspace": ({"size": -1}, "--policy.workspace: workspace size and height_limit must be positive.*got -1"),
         "calibration": ({"units": "cm"}, "--policy.calibration: units must be m or mm, got 'cm'"),
         "camera_augmentation": (11, "--policy.camera_augmentation must lie in"),

@@ -14,6 +14,7 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.state_reader import END_EFFECTOR
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
@@ -106,6 +107,25 @@ def test_a_policy_reads_the_state_in_training_and_on_the_robot(robot, tmp_path, 
         assert policy.select_action(read).isfinite().all()
     with pytest.raises(ValueError, match="has 5 dimensions, the policy was trained with 7: ee"):
         preprocessor(observed | {keys.STATE: item[keys.STATE]})
+
+
+def test_views_of_absolute_positions_tell_the_policy_what_they_count_from(recorded, tmp_path, monkeypatch):
+    views_of(recorded, tmp_path / "views", state_origin="world")
+    checkpoint = train(monkeypatch, tmp_path / "views", tmp_path / "policy")
+    config = json.loads((checkpoint / "config.json").read_text())
+    assert config["state_origin"] == "world"
+    assert config["state_names"] == keys.STATE_NAMES
+    with pytest.raises(ValueError, match=r"state_origin=base: the dataset's views were made with --state_origin=world"):
+        train(monkeypatch, tmp_path / "views", tmp_path / "other", "--policy.state_origin=base")
+
+
+def test_robot_base_contradicts_positions_that_count_from_elsewhere(robot, recorded, tmp_path):
+    for options in ({"state_origin": "world"}, {}):
+        with pytest.raises(
+            CalibrationError, match="robot_base moves the cameras to the axes of the base, but the stat"
+        ):
+            views_of(recorded, tmp_path / "views", calibration=robot[1], **options)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_absolute_positions_under_our_names_are_centred(robot, recorded, tmp_path, monkeypatch):

@@ -6,18 +6,38 @@ A new one is a class derived from `MujocoWorld` and one derived from `MujocoSett
 from __future__ import annotations
 
 import math
+import os
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.camera import Array
+from lerobot_symview.runtime.cli import CommandError
 from symview_sim.settings import WorldSettings
 
 if TYPE_CHECKING:
     from symview_sim.worlds.env import MujocoEnv
+
+
+REMEDY = (
+    "install Mesa's software renderer, on Debian and Ubuntu apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, or "
+    "libosmesa6 and set MUJOCO_GL=osmesa"
+)
+
+
+def check_mujoco_import() -> None:
+    """Raise a CommandError if MuJoCo is installed and its import fails, as with a `MUJOCO_GL` that is not there."""
+    if find_spec("mujoco") is None:
+        return  # the error of the package that needs it names the extra
+    try:
+        import mujoco  # noqa: F401
+    except Exception as error:  # of the library that MUJOCO_GL names
+        chosen = os.environ.get("MUJOCO_GL", "")
+        raise CommandError(f"MuJoCo cannot draw with MUJOCO_GL={chosen}: {error}; unset it, or {REMEDY}") from None
 
 
 class MujocoWorld(ABC):
@@ -95,9 +115,14 @@ class MujocoSettings(WorldSettings):
         """Return the task. The simulator is imported only now."""
 
     def make(self) -> MujocoEnv:
-        """Return a new environment. MuJoCo is imported at its first reset."""
+        """Return a new environment.
+
+        Raises:
+            CommandError: if MuJoCo cannot be imported with the present `MUJOCO_GL`.
+        """
         from symview_sim.worlds.env import MujocoEnv
 
+        check_mujoco_import()
         return MujocoEnv(self)
 
 

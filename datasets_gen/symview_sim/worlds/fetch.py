@@ -75,8 +75,9 @@ class FetchSettings(MujocoSettings):
         Raises:
             ModuleNotFoundError: if Gymnasium-Robotics is not installed; the message names the extra.
         """
+        env = super().make()
         _push_env()
-        return super().make()
+        return env
 
     def make_world(self) -> FetchPush:
         """Return the task."""

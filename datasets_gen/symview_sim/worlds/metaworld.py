@@ -15,7 +15,7 @@ from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import check_name
 from symview_sim.settings import needs_extra
-from symview_sim.worlds.base import MujocoSettings, MujocoWorld, turned
+from symview_sim.worlds.base import MujocoSettings, MujocoWorld, check_mujoco_import, turned
 
 if TYPE_CHECKING:
     from symview_sim.worlds.env import MujocoEnv
@@ -68,8 +68,9 @@ class MetaWorldSettings(MujocoSettings):
             ModuleNotFoundError: if Meta-World is not installed; the message names the extra.
             ValueError: if Meta-World has no such task.
         """
+        env = super().make()
         check_task(self.task)
-        return super().make()
+        return env
 
     def make_world(self) -> MetaWorld:
         """Return the task."""
@@ -78,6 +79,7 @@ class MetaWorldSettings(MujocoSettings):
 
 def check_task(name: str) -> None:
     """Raise a ValueError that lists all tasks unless `name` is one of them."""
+    check_mujoco_import()
     check_name("task of Meta-World", name, _tasks())
 
 

@@ -15,12 +15,9 @@ import numpy as np
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.runtime.cli import CommandError
 from symview_sim.camera_rig import CameraImages
+from symview_sim.worlds.base import REMEDY
 
 MAX_GEOMS = 10_000
-REMEDY = (
-    "install Mesa's software renderer, on Debian and Ubuntu apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, or "
-    "libosmesa6 and set MUJOCO_GL=osmesa"
-)
 
 
 class MujocoRenderer:
@@ -78,6 +75,7 @@ class MujocoRenderer:
     def close(self) -> None:
         """Free the context."""
         _LIVE.discard(self)
+        self._context.make_current()  # what is freed is named in the current context, whose it may not be
         self._target.free()
         self._context.free()
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lerobot_symview import keys
 from lerobot_symview.calibration.board import DICTIONARIES
 from lerobot_symview.calibration.hand_eye import HandEye, hand_eye
-from lerobot_symview.datasets.features import Features, gripper_dimensions
+from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.source import SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Array
@@ -142,10 +142,10 @@ def gripper_poses(folder: Path, episodes: list[int], frames: int, chosen: list[s
 
 def _pose_columns(features: Features) -> tuple[list[int], bool]:
     """Return the indices of position and turn in the state, and whether positions are relative to the workspace."""
-    ours = gripper_dimensions(features)
-    if ours is not None:
-        return [column for column in ours[:4] if column is not None], True
     names = features.get(keys.STATE, {}).get("names") or []
+    pose = keys.STATE_NAMES[:4]
+    if set(pose) <= set(names):
+        return [names.index(name) for name in pose], True
     if not set(EE_NAMES) <= set(names):
         raise DatasetError(
             f"{keys.STATE} has no dimensions {', '.join(keys.STATE_NAMES[:4])} and no {', '.join(EE_NAMES)}; it has "

@@ -18,6 +18,7 @@ from lerobot_symview.calibration.file import (
     plain_lens,
 )
 from lerobot_symview.calibration.read import read_calibration
+from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Array, Camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import flagged
@@ -43,7 +44,13 @@ def existing_calibration(file: Path) -> Calibration:
     if not file.exists():
         return Calibration({})
     with flagged("--output"):
-        return read_calibration(file)
+        known = read_calibration(file)
+        if known.is_in_base_axes or known.origin_height:
+            raise CalibrationError(
+                f"{file} has robot_base or table_height, which place its cameras in another frame than this one: write "
+                "to another file, and copy the camera's entry"
+            )
+        return known
 
 
 def write_result(config: CalibrateConfig, known: Calibration, workspace: Workspace, result: Result) -> Path:

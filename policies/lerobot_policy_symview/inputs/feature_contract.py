@@ -12,12 +12,19 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.symmetry.representations import types_of
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import Calibration, parse_calibration, parse_workspace, plain_calibration
+from lerobot_symview.calibration.file import (
+    Calibration,
+    check_origin,
+    parse_calibration,
+    parse_workspace,
+    plain_calibration,
+)
 from lerobot_symview.datasets.features import image_size
 from lerobot_symview.datasets.metadata import ADDED_VIEWS, read_settings
 from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Camera, stored_camera
-from lerobot_symview.geometry.state_reader import StateReader
+from lerobot_symview.geometry.gripper_state import missing_of
+from lerobot_symview.geometry.state_reader import StateReader, is_end_effector
 from lerobot_symview.views import View, ViewSpec
 
 Features = dict[str, dict[str, Any]]
@@ -83,18 +90,36 @@ def _check_vectors(config: SymviewConfig, features: Features) -> None:
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             names = None
         size = int(features[key]["shape"][0])
-        if kind == "state":
-            counts_from_elsewhere = config.state_origin not in (None, "workspace")
-            given = names or (list(config.state_symmetry) if counts_from_elsewhere else [])
-            read = StateReader(tuple(given)).read_names
-            config.state_names = given if read != given or counts_from_elsewhere else []
-            names, size = (read, len(read)) if names else (names, size)
+        recorded = names or []
+        if kind == "state" and is_end_effector(recorded):
+            names = StateReader(tuple(recorded)).read_names
+            size = len(names)
         types = types_of(names or ())
         if types and getattr(config, f"{kind}_symmetry") == keys.STATE_NAMES:
             setattr(config, f"{kind}_symmetry", types)
         representation = config.states if kind == "state" else config.actions
         representation.check(size, key, names if config.group != "C1" else None)
+        if kind == "state":
+            config.state_names = recorded if is_end_effector(recorded) else []
+    _name_state(config)
     config.check()  # options that depend on the types
+
+
+def _name_state(config: SymviewConfig) -> None:
+    """Name the dimensions of a state whose positions count from elsewhere by their types.
+
+    Raises:
+        ValueError: if no dimensions are declared as positions.
+    """
+    if config.state_names or config.state_origin in (None, "workspace"):
+        return
+    missing = missing_of(config.state_symmetry)
+    if missing:
+        raise ValueError(
+            f"--policy.state_origin={config.state_origin} is of the gripper's position; --policy.state_symmetry="
+            f"{config.state_symmetry} lacks {missing}"
+        )
+    config.state_names = list(config.state_symmetry)
 
 
 def _own_names(config: SymviewConfig, features: Features) -> Features:
@@ -151,11 +176,15 @@ def read_calibration(config: SymviewConfig) -> None:
         CalibrationError: if the calibration in the dataset is invalid.
     """
     meta = getattr(config, "_runtime_dataset_meta", None)  # set by LeRobot before it makes the policy
+    if meta is not None:
+        _read_origin(config, meta)
     given = _calibration_file(meta) if meta is not None else None
     if given is None and config.calibration:
         given = parse_calibration(config.calibration)
     if given is not None and given.origin_height:
         config.origin_height = given.origin_height
+    if given is not None:
+        check_origin(given, config.state_origin, config.state_names or config.state_symmetry)
     if meta is not None and (config.uses_calibration or config.check_camera):
         name = next(iter(config.substitutes(meta.features)), config.camera)
         names = {config.camera: name} | {other: other for other in config.merged_cameras}  # own -> the dataset's
@@ -169,6 +198,23 @@ def read_calibration(config: SymviewConfig) -> None:
             config.calibration = plain_calibration(Calibration(cameras, depth_units=units))
         elif name != config.camera:
             config.calibration = {}
+
+
+def _read_origin(config: SymviewConfig, meta: Any) -> None:
+    """Take over what positions count from, as `symview-add-views` was told.
+
+    Raises:
+        ValueError: if the flag says something else.
+    """
+    stored = read_settings(Path(meta.root), ADDED_VIEWS).get("state_origin")
+    if stored is None or stored == config.state_origin:
+        return
+    if config.state_origin is not None:
+        raise ValueError(
+            f"--policy.state_origin={config.state_origin}: the dataset's views were made with --state_origin={stored}"
+        )
+    config.state_origin = stored
+    _name_state(config)
 
 
 def _fixed_camera(meta: Any, name: str) -> Camera | None:

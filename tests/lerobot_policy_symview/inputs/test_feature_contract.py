@@ -11,6 +11,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, parse_calibration, plain_calibration
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.runtime.flag_errors import FlagError
 from tests.helpers.cameras import make_camera
 from tests.helpers.policies import make_config
 
@@ -89,6 +90,24 @@ def test_declared_types_take_precedence_over_names():
     config = make_config(state_symmetry=["x", "y", "z", "scalar"], action_symmetry=["x", "y", "z", "scalar"])
     read_features(config, with_vectors(["x", "y", "z", "aperture"], ["dx", "dy", "dz", "aperture"]))
     assert config.state_symmetry == config.action_symmetry == ["x", "y", "z", "scalar"]
+
+
+def test_an_origin_is_of_the_declared_positions_whatever_their_names():
+    types = ["x", "y", "z", "aperture"]
+    config = make_config(state_symmetry=types, action_symmetry=types, state_origin="world")
+    read_features(config, with_vectors(["ee_x", "ee_y", "ee_z", "grip"], ["dx", "dy", "dz", "aperture"]))
+    assert config.state_names == ["x", "y", "z", "aperture"]
+    assert config.state_reader.converts
+    without = make_config(state_symmetry=["scalar"] * 4, gripper_input="vector", state_origin="world")
+    with pytest.raises(ValueError, match=r"state_origin=world is of the gripper's position; .* lacks x, y, z"):
+        read_features(without, with_vectors(["a", "b", "c", "d"], ["dx", "dy", "dz", "aperture"]))
+
+
+@pytest.mark.parametrize("turning", [["rx", "ry", "sign"], ["yaw"]])
+def test_a_gripper_that_turns_needs_its_yaw(turning):
+    options = {"state_symmetry": ["x", "y", "z", "aperture"], "action_symmetry": ["x", "y", "z", *turning, "aperture"]}
+    with pytest.raises(FlagError, match=r"gripper_input=image draws the gripper; .* lacks yaw, .* turns it: use"):
+        make_config(**options)
 
 
 def test_the_message_suggests_one_type_for_each_of_the_datasets_dimensions():

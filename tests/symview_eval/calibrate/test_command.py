@@ -114,6 +114,16 @@ def test_other_cameras_of_the_file_are_kept(run, photo, tmp_path):
     assert calibration.depth_units == {"wrist": 0.001}
 
 
+def test_a_file_in_the_axes_of_a_base_is_refused_and_kept(run, photo, tmp_path):
+    other = plain_calibration(Calibration({"wrist": camera_over(Board(), 70, -40)}))
+    text = yaml.safe_dump(other | {"robot_base": {"position": [0.1, 0.0, 0.02]}})
+    (tmp_path / "cameras.yaml").write_text(text)
+    code, error, _ = run(f"--images={photo}", INTRINSICS)
+    assert code == 2
+    assert "--output: cameras.yaml has robot_base or table_height" in error
+    assert (tmp_path / "cameras.yaml").read_text() == text
+
+
 def test_several_photographs_give_intrinsics_and_distortion(run, photos):
     code, error, log = run(f"--images={photos}")
     assert (code, error) == (0, "")

@@ -1,9 +1,13 @@
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from lerobot_symview.errors import OptionError
-from lerobot_symview.geometry.camera import project
+from lerobot_symview.geometry.camera import project, unproject
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from symview_sim.worlds.fetch import FetchSettings
 from symview_sim.worlds.metaworld import MetaWorldSettings
@@ -89,6 +93,20 @@ def test_the_state_is_where_the_image_shows_the_fingers(world):
     assert np.percentile(rows, 99) == pytest.approx(v, abs=20)  # nothing lower in the image moves
 
 
+def test_closing_an_environment_leaves_others_as_they_are():
+    first, second = (settings_of("metaworld").make() for _ in range(2))
+    expected = second.reset(seed=1)[0]["pixels"]["side"]
+    first.reset(seed=0)
+    first.close()
+    np.testing.assert_array_equal(second.reset(seed=1)[0]["pixels"]["side"], expected)
+
+
+def test_a_way_to_draw_that_is_not_there_is_an_error_in_one_line():
+    command = [sys.executable, "-c", "from symview_sim.worlds.fetch import FetchSettings; FetchSettings().make()"]
+    ended = subprocess.run(command, env=os.environ | {"MUJOCO_GL": "bad"}, capture_output=True, text=True, check=False)
+    assert "CommandError: MuJoCo cannot draw with MUJOCO_GL=bad: invalid value" in ended.stderr
+
+
 def test_cameras_of_other_sizes_and_places_see_the_same_table():
     left = CameraSpec("left", 24, 32, azimuth_deg=-60.0, distance=1.0)
     camera = CameraSpec(height=40, width=56, azimuth_deg=60.0, distance=1.0, spread=CameraSpread(azimuth_deg=20.0))
@@ -98,6 +116,9 @@ def test_cameras_of_other_sizes_and_places_see_the_same_table():
         observation, _ = env.reset(seed=seed)
         assert observation["pixels"]["left"].shape == (24, 32, 3)
         poses.append(observation["camera.side.world_from_cam"])
+        for name, placed in env.cameras.items():
+            heights = unproject(observation[f"images.{name}_depth"][0], placed)[..., 2]
+            assert (np.abs(heights) < 1e-3).mean() > 0.1  # the bare table
     assert not np.array_equal(*poses)
     env.close()
 
