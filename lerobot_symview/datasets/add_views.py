@@ -315,7 +315,8 @@ def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
 
 
 def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, Any]:
-    """Return all settings that determine the result."""
+    """Return all settings that determine the result, and those of earlier views that say how to read it."""
+    earlier = derivation.open_source().added_views
     return plain(
         {
             "repo_id": config.target().repo_id,
@@ -324,9 +325,11 @@ def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, An
             "camera": config.camera,
             "views": {name: asdict(view) for name, view in derivation.views.items()},
             "workspace": asdict(derivation.workspace),
-            "calibration": plain_calibration(derivation.calibration) if derivation.calibration else None,
+            "calibration": plain_calibration(derivation.calibration)
+            if derivation.calibration
+            else earlier.get("calibration"),
             "depth_units": derivation.depth_units,
-            "state_origin": derivation.state_origin,
+            "state_origin": derivation.state_origin or earlier.get("state_origin"),
             "left_out": derivation.dropped,
             "symview": version("lerobot_policy_symview"),
         }

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.calibration.file import Calibration, check_origin
+from lerobot_symview.calibration.file import Calibration, check_origin, parse_calibration
 from lerobot_symview.datasets.features import check_depth_size, gripper_dimensions, is_depth_feature, names_of
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
@@ -91,12 +91,15 @@ class FrameReader:
 
     @property
     def state_reader(self) -> StateReader:
-        """What reads the dataset's states."""
-        names = names_of(self.dataset.features, keys.STATE)
-        if self.calibration is not None:
-            check_origin(self.calibration, self.state_origin, names)
-        height = self.calibration.origin_height if self.calibration else 0.0
-        return StateReader(tuple(names), origin_of(self.state_origin, names, self.workspace, height))
+        """What reads the dataset's states: by the calibration file, this one or that of earlier views."""
+        names, earlier = names_of(self.dataset.features, keys.STATE), self.dataset.added_views
+        kind, calibration = self.state_origin or earlier.get("state_origin"), self.calibration
+        if calibration is None and earlier.get("calibration"):
+            calibration = parse_calibration(earlier["calibration"])
+        if calibration is not None:
+            check_origin(calibration, kind, names)
+        height = calibration.origin_height if calibration else 0.0
+        return StateReader(tuple(names), origin_of(kind, names, self.workspace, height))
 
     def features(self) -> list[str]:
         """Return the keys of the features that `frames` requires."""

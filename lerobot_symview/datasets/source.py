@@ -20,7 +20,7 @@ from pyarrow.compute import struct_field
 
 from lerobot_symview.datasets.features import Features, declared_unit, is_depth_feature
 from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb, encoded_size
-from lerobot_symview.datasets.metadata import is_count, pixels, read_info
+from lerobot_symview.datasets.metadata import ADDED_VIEWS, is_count, pixels, read_info, read_settings
 from lerobot_symview.errors import DatasetError
 from lerobot_symview.geometry.units import ABOVE_MINIMUM, METRES, MILLIMETRES, in_metres, infer_depth_unit, unit_name
 
@@ -50,6 +50,11 @@ class SourceDataset:
     def features(self) -> Features:
         """Feature declarations from `meta/info.json`."""
         return self.info["features"]
+
+    @cached_property
+    def added_views(self) -> dict[str, Any]:
+        """What `symview-add-views` was told when it made the dataset; empty for other datasets."""
+        return read_settings(self.folder, ADDED_VIEWS)
 
     @cached_property
     def episodes(self) -> list[dict[str, Any]]:

@@ -88,6 +88,17 @@ def test_views_are_those_of_our_own_states_in_the_axes_of_the_base(robot, record
     assert stored["calibration"]["robot_base"]["position"] == [0.0, 0.0, pytest.approx(0.03)]
 
 
+def test_a_view_that_is_added_later_is_clipped_at_the_same_height(robot, tmp_path):
+    """The calibration is in the dataset by then; the height of the base is in the file of the earlier views."""
+    folder, file, _, _ = robot
+    expected = views_of(folder, tmp_path / "at_once", calibration=file)
+    source = HubDataset("test/views", folder)
+    add_views(AddViewsConfig(source, new_root=tmp_path / "first", views=["persp"], calibration=file))
+    np.testing.assert_array_equal(views_of(tmp_path / "first", tmp_path / "second"), expected)
+    stored = json.loads((tmp_path / "second" / "meta" / "symview_views.json").read_text())
+    assert stored["calibration"]["robot_base"]["position"][2] == pytest.approx(0.03)
+
+
 def test_a_policy_reads_the_state_in_training_and_on_the_robot(robot, tmp_path, monkeypatch):
     folder, file, source, length = robot
     views_of(folder, tmp_path / "views", calibration=file)

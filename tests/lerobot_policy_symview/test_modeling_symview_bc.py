@@ -283,7 +283,7 @@ def test_the_head_has_the_papers_parameter_count():
         ({"method": "voxel_equi", "group": "D8"}, "use --policy.group=D4"),
         ({"encoder": "voxel"}, "use --policy.view=side"),
         ({"view": "side"}, "or --policy.method=sideview_equi"),
-        ({"state_symmetry": ["x", "y", "z"]}, "lacks .'yaw', 'aperture'.: use --policy.gripper_input=vector"),
+        ({"state_symmetry": ["x", "y", "z"]}, "lacks yaw, and .* turns it: use --policy.gripper_input=vector"),
     ],
 )
 def test_invalid_configuration_errors_name_the_flag(options, message):

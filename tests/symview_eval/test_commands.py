@@ -3,6 +3,7 @@
 import pytest
 
 from symview_eval import commands
+from symview_sim.generate import RecordedEnv, RecordedFetch, RecordedMetaWorld, RecordedWorld
 
 
 @pytest.fixture
@@ -17,7 +18,6 @@ def without(monkeypatch):
 @pytest.mark.parametrize(
     ("command", "words", "hidden", "extras"),
     [
-        ("generate", [], ["pybullet"], "sim"),
         ("train_rl", [], ["pybullet"], "sim"),
         ("benchmark", ["env"], ["pybullet"], "sim"),
         ("demo", [], ["pybullet", "matplotlib"], "sim,viz"),
@@ -35,6 +35,28 @@ def test_a_command_names_the_extra_that_is_missing(monkeypatch, capsys, without,
     error = capsys.readouterr().err
     assert error.endswith(f"not installed: pip install 'lerobot_policy_symview[{extras}]'\n")
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("env", "module", "extra"),
+    [
+        (RecordedEnv, "pybullet", "sim"),
+        (RecordedMetaWorld, "metaworld", "metaworld"),
+        (RecordedFetch, "gymnasium_robotics", "fetch"),
+    ],
+)
+def test_a_recording_names_the_extra_of_its_simulator(monkeypatch, capsys, tmp_path, env, module, extra):
+    def make(settings):
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+
+    monkeypatch.setattr(env, "make", make)
+    kind = RecordedWorld.get_choice_name(env)
+    monkeypatch.setattr("sys.argv", ["symview-generate", f"--env.type={kind}", f"--root={tmp_path / 'data'}"])
+    with pytest.raises(SystemExit) as end:
+        commands.generate()
+    assert end.value.code == 1
+    assert capsys.readouterr().err.endswith(f"not installed: pip install 'lerobot_policy_symview[{extra}]'\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("module", "raised"), [("ray", SystemExit), ("gears", ModuleNotFoundError)])
