@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.camera import stored_camera
-from lerobot_symview.geometry.gripper_state import gripper_columns, gripper_poses
+from lerobot_symview.geometry.gripper_state import gripper_columns, poses_from_states
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame, View, ViewSpec, other_cameras
@@ -238,6 +238,7 @@ class _Reporter:
 
     def __init__(self, config: SimulatorConfig, views: Sequence[View], workspace: Workspace):
         self._config, self._views, self._workspace = config, views, workspace
+        self._columns = gripper_columns(config.env.state_names)
         self.remembers = any(view.memory for view in views)
         self.start_episode()
 
@@ -261,6 +262,5 @@ class _Reporter:
         calibrated = stored_camera(
             features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
         )
-        columns = gripper_columns(self._config.env.state_names)
-        gripper = None if columns is None else gripper_poses(features[keys.STATE], columns)
+        gripper = None if self._columns is None else poses_from_states(features[keys.STATE], self._columns)
         return Frame(rgb, None if depth is None else depth[..., 0], calibrated, self._workspace, gripper)

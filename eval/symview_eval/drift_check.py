@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -156,8 +156,8 @@ def _write_moved(
         except CalibrationError as error:
             plane = f"; {error}"
     file = output_dir / "cameras.yaml"
-    height = reader.calibration.origin_height if reader.calibration else 0.0
-    calibration = Calibration({reader.camera: camera}, reader.workspace, origin_height=height)
+    known = reader.states_calibration or Calibration({})
+    calibration = replace(known, cameras={reader.camera: camera}, workspace=reader.workspace, depth_units={})
     replace_file(file, yaml.safe_dump(plain_calibration(calibration), sort_keys=False, default_flow_style=None))
     logger.info(
         "wrote %s: the camera as it stands in %s, turned by %.2f degrees and shifted by %.1f mm%s",

@@ -5,7 +5,8 @@ file and of a dataset are bit-identical. In place of `world_from_cam` the file m
 `cam_from_world`, or `position` and `quaternion_xyzw` of the camera in the world.
 
 With `robot_base`, everything is moved to the base's axes, with the origin on the table below it: cameras and
-workspace then fit states and actions in the frame of the base. With `table_height`, the table is moved to z = 0.
+workspace then fit states and actions in the frame of the base. With `table_height`, the table is moved to z = 0. A
+calibration that was moved so is written with `origin_height`, the height above the table of what states count from.
 
 The file is YAML or JSON:
 
@@ -96,7 +97,7 @@ def parse_calibration(content: Any) -> Calibration:
     """
     if not isinstance(content, Mapping):
         raise CalibrationError(f"expected a mapping with units and cameras, got {type(content).__name__}")
-    problems = _unknown_keys("the file", content, ("units", "workspace", "robot_base", "cameras"))
+    problems = _unknown_keys("the file", content, ("units", "workspace", "robot_base", "origin_height", "cameras"))
     units = content.get("units")
     if not isinstance(units, str) or units not in METRES:
         problems.append(f"units must be m or mm, got {units!r}")
@@ -126,11 +127,17 @@ def parse_calibration(content: Any) -> Calibration:
             world_from_base = _base_pose(content["robot_base"], metres)
         except ValueError as error:
             problems.append(f"robot_base: {error}")
-    if not abs(world_from_base[2, 3] - table_height) <= HIGHEST:
-        problems.append(f"robot_base and table_height must be less than {HIGHEST:g} m apart")
+    try:
+        (origin_height,) = _numbers("origin_height", content.get("origin_height", 0.0), (1,), "a number of metres")
+    except CalibrationError as error:
+        problems.append(str(error))
+        origin_height = 0.0
+    height = float(origin_height + world_from_base[2, 3] - table_height)
+    if not abs(height) <= HIGHEST:
+        problems.append(f"the states' origin must be within {HIGHEST:g} m of the table, got {height:.3g} m above it")
     if problems:
         raise CalibrationError("; ".join(problems))
-    found = Calibration(cameras, workspace, depth_units, is_in_base_axes=has_base)
+    found = Calibration(cameras, workspace, depth_units, height, has_base)
     return _on_table(found, world_from_base, table_height)
 
 
@@ -189,8 +196,7 @@ def _on_table(calibration: Calibration, world_from_base: Array, table_height: fl
     if workspace is not None:
         x, y, _ = moved[:3, :3] @ [*workspace.center, 0.0] + moved[:3, 3]
         workspace = replace(workspace, center=(round(float(x), 9), round(float(y), 9)))
-    height = float(world_from_base[2, 3]) - table_height
-    return replace(calibration, cameras=cameras, workspace=workspace, origin_height=height)
+    return replace(calibration, cameras=cameras, workspace=workspace)
 
 
 def parse_workspace(entries: Any) -> Workspace:
@@ -227,8 +233,10 @@ def plain_calibration(calibration: Calibration) -> dict[str, Any]:
         for name, camera in calibration.cameras.items()
     }
     content: dict[str, Any] = {"units": "m", "cameras": cameras}
-    if calibration.origin_height or calibration.is_in_base_axes:
-        content["robot_base"] = {"position": [0.0, 0.0, calibration.origin_height]}
+    if calibration.origin_height:
+        content["origin_height"] = calibration.origin_height
+    if calibration.is_in_base_axes:
+        content["robot_base"] = {}  # everything is in its axes by now
     if calibration.workspace is not None:
         content["workspace"] = asdict(calibration.workspace) | {"center": list(calibration.workspace.center)}
     return content

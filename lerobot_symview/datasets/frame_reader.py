@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice, repeat
 from typing import Any
 
@@ -16,7 +17,7 @@ from lerobot_symview.datasets.features import check_depth_size, gripper_dimensio
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
 from lerobot_symview.errors import CalibrationError, DatasetError
 from lerobot_symview.geometry.camera import Camera, aligned_depth, stored_camera
-from lerobot_symview.geometry.gripper_state import gripper_poses
+from lerobot_symview.geometry.gripper_state import poses_from_states
 from lerobot_symview.geometry.state_reader import StateOrigin, StateReader, origin_of
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import Frame, View, other_cameras
@@ -89,13 +90,17 @@ class FrameReader:
         is_used = any(view.uses_gripper for view in self.views)
         return is_used and gripper_dimensions(self.dataset.features, self.state_reader.read_names) is not None
 
-    @property
+    @cached_property
+    def states_calibration(self) -> Calibration | None:
+        """The calibration file by which states are read: the given one, or that of earlier views."""
+        stored = self.dataset.added_views.get("calibration")
+        return self.calibration or (parse_calibration(stored) if stored else None)
+
+    @cached_property
     def state_reader(self) -> StateReader:
-        """What reads the dataset's states: by the calibration file, this one or that of earlier views."""
-        names, earlier = names_of(self.dataset.features, keys.STATE), self.dataset.added_views
-        kind, calibration = self.state_origin or earlier.get("state_origin"), self.calibration
-        if calibration is None and earlier.get("calibration"):
-            calibration = parse_calibration(earlier["calibration"])
+        """What reads the dataset's states."""
+        names, calibration = names_of(self.dataset.features, keys.STATE), self.states_calibration
+        kind = self.state_origin or self.dataset.added_views.get("state_origin")
         if calibration is not None:
             check_origin(calibration, kind, names)
         height = calibration.origin_height if calibration else 0.0
@@ -171,7 +176,7 @@ class FrameReader:
             reader = self.state_reader
             pose = gripper_dimensions(self.dataset.features, reader.read_names)
             assert pose is not None
-            states = iter(gripper_poses(reader.read(vectors(table, keys.STATE)), pose))
+            states = iter(poses_from_states(reader.read(vectors(table, keys.STATE)), pose))
         calibrations: Iterator[Any] = repeat(None)
         if self.given_camera is None:
             names = [keys.parameter(key) for key in self._calibration()]

@@ -33,7 +33,7 @@ def missing_of(names: Sequence[str], turns: bool = False) -> str:
     return ", ".join(name for name in needed if name not in names)
 
 
-def gripper_poses(states: Any, columns: Sequence[int | None]) -> Any:
+def poses_from_states(states: Any, columns: Sequence[int | None]) -> Any:
     """Return the gripper's x, y, z, yaw and aperture of states (..., N): (..., 5), same array type and dtype.
 
     Args:

@@ -22,10 +22,12 @@ from lerobot_policy_symview.configuration import SymviewConfig
 HUB_OPTIONS = ("force_download", "proxies", "token", "cache_dir", "local_files_only", "revision")
 
 
-def check_processor_files(config: SymviewConfig, model: str, options: dict[str, Any]) -> dict[str, Any] | None:
+def check_processor_files(
+    config: SymviewConfig, model: str, options: dict[str, Any]
+) -> dict[str, dict[str, Any]] | None:
     """Check that the processor files of a policy name only the steps of the policy's own pipelines.
 
-    Return the options of the step that makes views; None where there is no file.
+    Return the options of the preprocessor's steps by name; None where there is no step that makes views.
 
     Args:
         config: the policy's configuration.
@@ -37,7 +39,7 @@ def check_processor_files(config: SymviewConfig, model: str, options: dict[str, 
     """
     from lerobot_policy_symview.processor_pipelines import make_processors
 
-    views: dict[str, Any] | None = None
+    saved: dict[str, dict[str, Any]] = {}
     names = (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME)
     for name, pipeline in zip(names, make_processors(config), strict=True):
         file = _file(model, f"{name}.json", options)
@@ -53,9 +55,8 @@ def check_processor_files(config: SymviewConfig, model: str, options: dict[str, 
             state = step.get("state_file", "")
             if Path(state).name != state:
                 raise ValueError(f"{file}: the state_file of {step_name} must be in the same folder, got {state!r}")
-            if step_name == "symview_views":
-                views = step.get("config", {})
-    return views
+            saved[step_name] = step.get("config", {})
+    return saved if "symview_views" in saved else None
 
 
 def _file(model: str, name: str, options: dict[str, Any]) -> Path | None:

@@ -24,7 +24,7 @@ def make_processors(
 ]:
     """Return LeRobot's default preprocessor and postprocessor with our steps added: the state, depth, and the views.
 
-    One reads states of other conventions, where the policy was trained with one. The other converts depth to metres and
+    One reads states of other conventions, if the policy was trained with one. The other converts depth to metres and
     renders the policy's view if an observation lacks it.
 
     Args:
@@ -38,12 +38,11 @@ def make_processors(
     """
     steps = make_default_policy_processor_steps(config, dataset_stats)
     reader = config.state_reader
-    read_state = [StateProcessorStep(list(reader.names), list(reader.origin))] if reader.converts else []
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,
             steps.add_batch_dim,
-            *read_state,
+            StateProcessorStep(list(reader.names), list(reader.origin)),
             steps.to_device,
             ViewsProcessorStep(
                 views=config.views_to_make,
@@ -61,14 +60,18 @@ def make_processors(
     )
 
 
-def changed_options(config: SymviewConfig, saved: dict[str, Any]) -> list[str]:
-    """Return the options of the added step that flags or a dataset gave another value than a checkpoint's `saved`.
+def changed_options(config: SymviewConfig, saved: dict[str, dict[str, Any]]) -> list[str]:
+    """Return the options of our steps that flags or a dataset gave another value than a checkpoint's `saved`.
 
-    Options that the checkpoint does not have yet had their defaults.
+    Steps and options that the checkpoint does not have yet had their defaults.
     """
-    step = next(step for step in make_processors(config)[0].steps if isinstance(step, ViewsProcessorStep))
-    options, defaults = (json.loads(json.dumps(one.get_config())) for one in (step, ViewsProcessorStep()))
-    return [name for name, value in options.items() if saved.get(name, defaults[name]) != value]
+    changed = []
+    for step in make_processors(config)[0].steps:
+        if isinstance(step, StateProcessorStep | ViewsProcessorStep):
+            options, defaults = (json.loads(json.dumps(one.get_config())) for one in (step, type(step)()))
+            known = saved.get(type(step)._registry_name, {})
+            changed += [name for name, value in options.items() if known.get(name, defaults[name]) != value]
+    return changed
 
 
 def _delivered_units(config: SymviewConfig) -> dict[str, float]:

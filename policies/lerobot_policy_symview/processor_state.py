@@ -19,7 +19,7 @@ class StateProcessorStep(ObservationProcessorStep):
     """Reads `observation.state` as x, y, z relative to the workspace's centre, yaw, aperture, and what else it has.
 
     Args:
-        names: of the state's dimensions.
+        names: of the state's dimensions; without names, the state is kept unchanged.
         origin: the workspace's centre on the table in the frame of the state's positions, metres.
     """
 
@@ -38,7 +38,7 @@ class StateProcessorStep(ObservationProcessorStep):
         Raises:
             ValueError: if the state has another number of dimensions than `names`.
         """
-        if keys.STATE not in observation:
+        if keys.STATE not in observation or not self._reader.converts:
             return observation
         state = observation[keys.STATE]
         if state.shape[-1] != len(self.names):

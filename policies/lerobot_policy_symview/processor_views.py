@@ -22,7 +22,7 @@ from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.gripper_state import gripper_poses
+from lerobot_symview.geometry.gripper_state import poses_from_states
 from lerobot_symview.geometry.units import METRES, parse_unit
 from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
 from lerobot_symview.views import Frame, View, ViewSpec, make_views, other_cameras
@@ -229,7 +229,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
         if self.gripper and any(view.uses_gripper for view in views.values()):
             needed.append(keys.STATE)
             if keys.STATE in observation:
-                gripper = gripper_poses(observation[keys.STATE].detach(), self.gripper)
+                gripper = poses_from_states(observation[keys.STATE].detach(), self.gripper)
         batches: dict[str, FrameBatch] = {}
         for name, camera in self._observed.items():
             merging = [view for view in views.values() if name == self.camera or name in view.cameras]

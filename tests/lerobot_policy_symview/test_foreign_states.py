@@ -85,7 +85,7 @@ def test_views_are_those_of_our_own_states_in_the_axes_of_the_base(robot, record
     expected = np.rot90(ours, -1, axes=(-2, -1))
     assert (np.abs(theirs - expected).max(axis=1) > 0.01).mean() < 0.01  # points on the edge of two cells
     stored = json.loads((tmp_path / "theirs" / "meta" / "symview_views.json").read_text())
-    assert stored["calibration"]["robot_base"]["position"] == [0.0, 0.0, pytest.approx(0.03)]
+    assert stored["calibration"]["origin_height"] == pytest.approx(0.03)
 
 
 def test_a_view_that_is_added_later_is_clipped_at_the_same_height(robot, tmp_path):
@@ -96,7 +96,7 @@ def test_a_view_that_is_added_later_is_clipped_at_the_same_height(robot, tmp_pat
     add_views(AddViewsConfig(source, new_root=tmp_path / "first", views=["persp"], calibration=file))
     np.testing.assert_array_equal(views_of(tmp_path / "first", tmp_path / "second"), expected)
     stored = json.loads((tmp_path / "second" / "meta" / "symview_views.json").read_text())
-    assert stored["calibration"]["robot_base"]["position"][2] == pytest.approx(0.03)
+    assert stored["calibration"]["origin_height"] == pytest.approx(0.03)
 
 
 def test_a_policy_reads_the_state_in_training_and_on_the_robot(robot, tmp_path, monkeypatch):
@@ -137,6 +137,33 @@ def test_robot_base_contradicts_positions_that_count_from_elsewhere(robot, recor
         ):
             views_of(recorded, tmp_path / "views", calibration=robot[1], **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_takes_another_origin_from_a_flag(robot, recorded, tmp_path, monkeypatch):
+    """Fine-tuned on data whose positions count from the world, a policy makes its preprocessing anew."""
+    first = train(monkeypatch, recorded, tmp_path / "first")
+    again = train(
+        monkeypatch, recorded, tmp_path / "again", "--policy.state_origin=world", policy=(f"--policy.path={first}",)
+    )
+    saved = json.loads((again / "policy_preprocessor.json").read_text())["steps"]
+    (state,) = [step["config"] for step in saved if step["registry_name"] == "symview_state"]
+    assert state == {"names": keys.STATE_NAMES, "origin": [0.45, 0.0, 0.0]}
+
+
+def test_a_table_height_is_kept_by_views_and_policy(recorded, robot, tmp_path, monkeypatch):
+    """Positions that count from the world, 0.8 m below the table; nothing of it changes a view."""
+    content = yaml.safe_load(robot[1].read_text())
+    del content["robot_base"]
+    for camera in content["cameras"].values():
+        camera["world_from_cam"][11] += 0.8
+    content["workspace"]["table_height"] = 0.8
+    file = tmp_path / "cameras.yaml"
+    file.write_text(yaml.safe_dump(content))
+    options = {"calibration": file, "state_origin": "world"}
+    add_views(AddViewsConfig(HubDataset("t/v", robot[0]), new_root=tmp_path / "v", views=["persp"], **options))
+    checkpoint = train(monkeypatch, tmp_path / "v", tmp_path / "policy", "--policy.method=persp_equi")
+    config = json.loads((checkpoint / "config.json").read_text())
+    assert (config["state_origin"], config["origin_height"]) == ("world", pytest.approx(-0.8))
 
 
 def test_absolute_positions_under_our_names_are_centred(robot, recorded, tmp_path, monkeypatch):

@@ -19,14 +19,14 @@ METAWORLD_TASKS = (
     "sweep-into-v3",
     "coffee-push-v3",
 )
-FOREIGN: dict[str, type[WorldSettings]] = dict.fromkeys(METAWORLD_TASKS, MetaWorldSettings) | {
+SETTINGS: dict[str, type[WorldSettings]] = dict.fromkeys(METAWORLD_TASKS, MetaWorldSettings) | {
     "FetchPush": FetchSettings
 }
-FOREIGN_TASKS = tuple(FOREIGN)
+FOREIGN_TASKS = tuple(SETTINGS)
 
 
 def world_settings(task: str, *, oracle: bool, **settings: Any) -> WorldSettings:
     """Return the settings of a task's simulator; only PyBullet's has an oracle."""
-    if task in FOREIGN:
-        return FOREIGN[task](task=task, **settings)
+    if task in SETTINGS:
+        return SETTINGS[task](task=task, **settings)
     return EnvSettings(task=task, oracle=oracle, **settings)

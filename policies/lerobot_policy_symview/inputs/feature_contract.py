@@ -79,6 +79,7 @@ def name_inputs(config: SymviewConfig) -> None:
     """Name the inputs of a checkpoint by its camera, which a flag may have changed: LeRobot compares them with data."""
     if config.input_features:
         config.input_features = config.own_names(config.input_features)
+        _name_state(config)
 
 
 def _check_vectors(config: SymviewConfig, features: Features) -> None:

@@ -25,7 +25,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration
 from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.gripper import gripper_image
-from lerobot_symview.geometry.gripper_state import POSE, gripper_columns, gripper_poses
+from lerobot_symview.geometry.gripper_state import POSE, gripper_columns, poses_from_states
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
 
@@ -231,7 +231,7 @@ class ImageInput(SceneInput):
         """Draw the gripper (B, pixels, pixels); a hand without yaw turns with a transformed scene only."""
         columns = gripper_columns(self.config.state_symmetry, self.config.gripper_turns)
         assert columns is not None  # checked with the configuration
-        pose = gripper_poses(state, columns)
+        pose = poses_from_states(state, columns)
         if columns[POSE.index("yaw")] is None and transform is not None:
             pose[:, POSE.index("yaw")] = transform.angle
         drawn: Tensor = gripper_image(pose, self.workspace, pixels)

@@ -72,7 +72,9 @@ def test_a_table_at_another_height_is_at_z_0(base):
     assert calibration.workspace == Workspace((0.45, 0.1))
     assert calibration.origin_height == pytest.approx(0.1 if base else -0.8)
     again = parse_calibration(plain_calibration(calibration))
-    assert again.origin_height == calibration.origin_height
+    assert (again.origin_height, again.is_in_base_axes) == (calibration.origin_height, base is not None)
+    with pytest.raises(CalibrationError, match=r"origin must be within 3 m of the table, got -4.8 m"):
+        parse_calibration(given | {"origin_height": -4.0})
     with pytest.raises(CalibrationError, match="workspace: table_height must be a number of metres"):
         parse_calibration(content() | {"workspace": {"table_height": "low"}})
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_symview.geometry.gripper_state import gripper_columns, gripper_poses, missing_of
+from lerobot_symview.geometry.gripper_state import gripper_columns, missing_of, poses_from_states
 
 STATES = np.array([[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]])
 
@@ -30,6 +30,6 @@ def test_without_its_yaw_a_gripper_that_turns_is_unknown():
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy], ids=["numpy", "torch"])
 def test_a_hand_without_yaw_never_turns_and_one_without_aperture_is_open(kind):
-    poses = gripper_poses(kind(STATES), [3, 2, 1, None, None])
+    poses = poses_from_states(kind(STATES), [3, 2, 1, None, None])
     assert type(poses) is type(kind(STATES))
     np.testing.assert_array_equal(np.asarray(poses), [[0.4, 0.3, 0.2, 0.0, 1.0], [0.8, 0.7, 0.6, 0.0, 1.0]])
