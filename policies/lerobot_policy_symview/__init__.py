@@ -5,6 +5,7 @@ configurations and the processor steps; networks and the simulator are imported 
 """
 
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
+from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.encoders import register_encoder
 from lerobot_policy_symview.env_symview import FetchEnvConfig, MetaWorldEnvConfig, SymviewEnvConfig
@@ -20,6 +21,7 @@ __all__ = [
     "StateProcessorStep",
     "SymviewBcConfig",
     "SymviewEnvConfig",
+    "SymviewFlowConfig",
     "SymviewSacfdConfig",
     "ViewsProcessorStep",
     "register_encoder",

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from lerobot.configs.policies import PreTrainedConfig
 
-from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.configuration_chunks import ChunkConfig
 
 
 @PreTrainedConfig.register_subclass("symview_bc")
 @dataclass
-class SymviewBcConfig(SymviewConfig):
+class SymviewBcConfig(ChunkConfig):
     """Behaviour cloning on top-down views from freely placed cameras. The defaults are the paper's."""
 
     aperture_noise: float = 0.0
@@ -21,7 +21,7 @@ class SymviewBcConfig(SymviewConfig):
     apertures are out of distribution."""
 
     def check(self) -> None:
-        """Check the fields of all policies and those of behaviour cloning."""
+        """Check the fields of all policies, those of chunks, and those of behaviour cloning."""
         super().check()
         if not 0 <= self.aperture_noise < math.inf:
             raise ValueError(f"--policy.aperture_noise must be finite and at least 0, got {self.aperture_noise}")

@@ -51,6 +51,8 @@ class SymviewSacfdConfig(SymviewConfig):
     def check(self) -> None:
         """Check the fields of all policies and those of soft actor-critic."""
         super().check()
+        if self.n_obs_steps != 1:
+            raise ValueError(f"--policy.n_obs_steps must be 1 for symview_sacfd, got {self.n_obs_steps}")
         if self.camera_augmentation:
             raise ValueError(
                 "--policy.camera_augmentation is for cloned policies: simulators give views in place of images"

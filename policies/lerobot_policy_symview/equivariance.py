@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.inputs.history import as_history
 from lerobot_policy_symview.nn.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
@@ -28,6 +29,7 @@ from lerobot_symview.geometry.placement import CameraSpec
 
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-10, torch.bfloat16: 5e-2}
 LEAST_SCALE = 0.1
+EXAMPLES = 2
 ObservationBatch = dict[str, Tensor]
 """Feature -> (B, ...)."""
 
@@ -77,29 +79,38 @@ def equivariance_errors(
 ) -> dict[int, float]:
     """Return, for every group element, how far the action for the transformed scene is from the transformed action.
 
-    It is the largest difference of any dimension, relative to the dimension's largest value or, if that is more, a
-    tenth of its range in the data. Elements that do not map pixels onto pixels interpolate images, which alone makes a
-    difference. Arguments as for `assert_equivariant`.
+    Policies that sample get transformed noise. The distance is the largest difference of any dimension of any action,
+    relative to the dimension's largest value or, if that is more, a tenth of its range in the data. Elements that do
+    not map pixels onto pixels interpolate images, which alone makes a difference. Arguments are those of
+    `assert_equivariant`.
     """
     config = policy.config
     preprocess, postprocess = processors or make_processors(config)
-    raw = observation or example_observation(config, policy.action_center.dtype)
+    history = policy.history_length if observation is None else 1
+    raw = observation or example_observation(config, policy.action_center.dtype, batch=EXAMPLES * history)
     group = checked_group(config)
     training = policy.training
+    noise = policy.draw_noise(len(raw[keys.STATE]) // history, torch.Generator().manual_seed(0))
 
-    def act(batch: ObservationBatch) -> Tensor:
-        action: Tensor = postprocess(policy.select_action(preprocess(dict(batch))))
-        return action
+    def act(frames: ObservationBatch, noise: Tensor) -> Tensor:
+        """Return the actions (H B, A) of chunks, all samples of a time together."""
+        batch = preprocess(dict(frames))
+        chunk = policy.predict_action_chunk(as_history(batch, history) if history > 1 else batch, noise=noise)
+        actions: Tensor = postprocess(chunk.transpose(0, 1).flatten(0, 1))
+        return actions
 
-    action = act(raw)
-    scale = torch.maximum(action.abs().amax(dim=0), LEAST_SCALE * policy.action_width.to(action))
+    action = act(raw, noise)
+    width = policy.action_width.reshape(-1, action.shape[-1])[0]  # of the first action of a chunk
+    scale = torch.maximum(action.abs().amax(dim=0), LEAST_SCALE * width.to(action))
     for first, second in config.actions.pairs:
         scale[first] = scale[second] = torch.maximum(scale[first], scale[second])
     errors = {}
     for element in range(1, group.size):
-        transform = PlanarTransform.of_element(group, element, action)
-        expected = config.actions.transform(action, transform, absolute_yaw=False)
-        actual = act(transform_observation(raw, config, group, element, camera))
+        expected = policy.transform_actions(action, PlanarTransform.of_element(group, element, action))
+        moved = config.actions.transform(
+            noise.flatten(0, 1), PlanarTransform.of_element(group, element, noise.flatten(0, 1)), absolute_yaw=False
+        ).view_as(noise)
+        actual = act(transform_observation(raw, config, group, element, camera), moved)
         errors[element] = float(((actual - expected).abs().amax(dim=0) / scale).max())
     policy.train(training)
     return errors
@@ -165,7 +176,9 @@ def _reflected_image(observation: ObservationBatch, config: SymviewConfig, camer
     return reflected
 
 
-def example_observation(config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = 2) -> ObservationBatch:
+def example_observation(
+    config: SymviewConfig, dtype: torch.dtype = torch.float32, batch: int = EXAMPLES
+) -> ObservationBatch:
     """Return random images, a camera's calibration and gripper poses for a policy, the same at every call."""
     generator = torch.Generator().manual_seed(0)
     placed = CameraSpec(name=config.camera).place(parse_workspace(config.workspace))

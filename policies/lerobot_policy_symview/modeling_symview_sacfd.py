@@ -13,6 +13,8 @@ from torch.nn import functional
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.nn.heads import GaussianHead
 from lerobot_policy_symview.policy import Network, SymviewPolicy
+from lerobot_policy_symview.tracing import is_exporting
+from lerobot_symview import keys
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 EPSILON = 1e-6  # keeps the logarithm finite where tanh saturates and 1 - action ** 2 is 0
@@ -38,10 +40,29 @@ class SymviewSacfdPolicy(SymviewPolicy):
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, Any]]:
         """Return the squared error of the scaled evaluation action, a scalar or per sample (B,), and no metrics."""
-        observation, state, action = self.training_input(batch)
+        observation, state, action = self._training_input(batch)
         mode = self.best_action(self.network, observation, state)
         errors = functional.mse_loss(mode, action, reduction="none").mean(dim=1)
         return (errors if reduction == "none" else errors.mean()), {}
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return actions (B, 1, A): dx, dy, dz in metres, dyaw in radians, aperture, in the declared order."""
+        return self.select_action(batch)[:, None]
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return the action (B, A) for observations (B, ...).
+
+        Raises:
+            DivergenceError: if it is not finite; an exported policy does not check it.
+        """
+        self.eval()
+        with self.precision():
+            scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
+        action = self.physical(scaled)
+        if not is_exporting():  # an exported program has no branches on values
+            self.check_action(action, batch)
+        return action
 
     def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
         """Return the scaled evaluation action (B, A): tanh(mean)."""
@@ -58,6 +79,15 @@ class SymviewSacfdPolicy(SymviewPolicy):
         noise = torch.randn_like(mean)
         action = torch.tanh(mean + log_std.exp() * noise)
         return action, log_prob_of(action, noise, log_std)
+
+    def _training_input(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return `network_input` and scaled actions (B, A), randomly transformed and cropped in training mode."""
+        state, action, transform, crop_offset = batch[keys.STATE], batch[keys.ACTION], None, None
+        if self.training:
+            transform, crop_offset = self.random_transform(state), torch.rand(len(state), 2, device=state.device)
+        if transform is not None:
+            action = self.config.actions.transform(action, transform, absolute_yaw=False)
+        return *self.network_input(batch, transform, crop_offset), self.scaled(action)
 
 
 def log_prob_of(action: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
@@ -41,6 +40,9 @@ from lerobot_symview.errors import DivergenceError
 
 ENDS = ("min", "max")
 logger = logging.getLogger(__name__)
+
+Stats = Mapping[str, Any]
+"""`min` and `max` of a vector, (N,) each."""
 
 MakeHead = Callable[[int, NDArray[np.float64]], nn.Module]
 """Takes n, the number of regular fields, and the actions' representation (G, A, A); returns the head."""
@@ -98,10 +100,9 @@ class SymviewPolicy(PreTrainedPolicy):
         self.network = Network(config, self.state_input, make_head)
         self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
         stats = dataset_stats or {}
-        action = _scale(stats.get(keys.ACTION), config.actions)
-        recorded = stats.get(keys.STATE)
-        ranges = recorded and {end: config.state_reader.read_range(torch.as_tensor(recorded[end])) for end in ENDS}
-        state = self.state_input.scale(*_scale(ranges, config.states))
+        ranges = self._state_ranges(stats.get(keys.STATE))
+        action = self.action_scale(stats.get(keys.ACTION), ranges)
+        state = self.state_input.scale(*scale_of(ranges, config.states))
         for name, (center, width) in {"action": action, "state": state}.items():
             self.register_buffer(f"{name}_center", center)
             self.register_buffer(f"{name}_width", width)
@@ -145,9 +146,13 @@ class SymviewPolicy(PreTrainedPolicy):
         state_dict = with_reference(state_dict, self.reference_image if self.config.check_camera else None)
         return super().load_state_dict(state_dict, strict, assign)
 
-    @abstractmethod
-    def best_action(self, network: Network, observation: Tensor, state: Tensor) -> Tensor:
-        """Return the scaled action (B, A) of a network in evaluation; it has the trained or the averaged weights."""
+    def action_scale(self, action: Stats | None, state: Stats | None) -> tuple[Tensor, Tensor]:
+        """Return centre and half-width of the network's output for the ranges of actions and states in the dataset."""
+        return scale_of(action, self.config.actions)
+
+    def _state_ranges(self, recorded: Stats | None) -> Stats | None:
+        """Return the ranges of states as they are read, for the ranges of recorded states."""
+        return recorded and {end: self.config.state_reader.read_range(torch.as_tensor(recorded[end])) for end in ENDS}
 
     def get_optim_params(self) -> Any:
         """Return all trained parameters; they share a learning rate."""
@@ -187,28 +192,28 @@ class SymviewPolicy(PreTrainedPolicy):
         card.validate()
         return card
 
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return actions (B, 1, A): dx, dy, dz in metres, dyaw in radians, aperture, in the declared order."""
-        return self.select_action(batch)[:, None]
+    def draw_noise(self, samples: int, generator: torch.Generator | None = None) -> Tensor:
+        """Return the noise (B, H, A) from which `predict_action_chunk` makes chunks; here, policies do not sample."""
+        return self.action_center.new_zeros(samples, 1, len(self.config.action_symmetry))
 
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the action (B, A) for observations (B, ...).
+    def transform_actions(self, actions: Tensor, transform: PlanarTransform) -> Tensor:
+        """Return actions (B, A) for transformed scenes."""
+        return self.config.actions.transform(actions, transform, absolute_yaw=False)
+
+    @property
+    def history_length(self) -> int:
+        """Number of observations that the network sees."""
+        return 1
+
+    def check_first_image(self, batch: dict[str, Tensor]) -> None:
+        """Compare the first observation (B, ...) with the demonstrations' image, if `check_camera` is on.
 
         Raises:
-            DivergenceError: if it is not finite; an exported policy does not check it.
-            CalibrationError: with `check_camera`, if the first image shows something else than the demonstrations.
+            CalibrationError: if it shows something else.
         """
-        self.eval()
         if self.config.check_camera and not (self._is_camera_checked or is_exporting()):
             check_observation(self.config, self.reference_image, self.scene.own_names(batch))
             self._is_camera_checked = True
-        with self.precision():
-            scaled = self.best_action(self.averaged or self.network, *self.network_input(batch))
-        action = self.physical(scaled)
-        if not is_exporting():  # an exported program has no branches on values
-            self.check_action(action, batch)
-        return action
 
     def check_action(self, action: Tensor, batch: dict[str, Tensor]) -> None:
         """Check that actions (B, A), chosen for the observations in `batch`, are finite.
@@ -240,15 +245,6 @@ class SymviewPolicy(PreTrainedPolicy):
         """Return the actions (B, A) in metres and radians."""
         return scaled * self.action_width + self.action_center
 
-    def training_input(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return `network_input` and scaled actions (B, A), randomly transformed and cropped in training mode."""
-        state, action, transform, crop_offset = batch[keys.STATE], batch[keys.ACTION], None, None
-        if self.training:
-            transform, crop_offset = self.random_transform(state), torch.rand(len(state), 2, device=state.device)
-        if transform is not None:
-            action = self.config.actions.transform(action, transform, absolute_yaw=False)
-        return *self.network_input(batch, transform, crop_offset), self.scaled(action)
-
     def random_transform(self, like: Tensor) -> PlanarTransform | None:
         """Draw a transform for each sample of `like` (B, ...), as `augmentation` says; None without augmentation."""
         if self.config.augmentation == "none":
@@ -278,7 +274,8 @@ def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
     return [name for name, tensor in tensors.items() if not tensor.isfinite().all()]
 
 
-def _scale(stats: dict[str, Any] | None, representation: VectorRepresentation) -> tuple[Tensor, Tensor]:
+def scale_of(stats: Stats | None, representation: VectorRepresentation) -> tuple[Tensor, Tensor]:
+    """Return centre and half-width (N,) of a vector's range, `min` and `max`; 0 and 1 where it is unknown."""
     if stats is None:
         return torch.zeros(len(representation.dimensions)), torch.ones(len(representation.dimensions))
     return representation.scale(*(torch.as_tensor(stats[name], dtype=torch.float32) for name in ENDS))

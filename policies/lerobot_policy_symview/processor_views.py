@@ -18,6 +18,7 @@ from torch import Tensor
 
 from lerobot_policy_symview.inputs.camera_augmentation import augment
 from lerobot_policy_symview.inputs.depth_reader import DepthReader
+from lerobot_policy_symview.inputs.history import as_frames, as_history, history_length
 from lerobot_policy_symview.inputs.observed_camera import ObservedCamera
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration, parse_workspace
@@ -108,7 +109,17 @@ class ViewsProcessorStep(ObservationProcessorStep):
         self._checked = False
 
     def observation(self, observation: RobotObservation) -> RobotObservation:
-        """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size)."""
+        """Return the observation with depth in metres and the views it lacks, float32 (B, C, size, size).
+
+        Observations with a history (B, T, ...) get views (B, T, C, size, size).
+        """
+        length = history_length(observation)
+        if length is not None:
+            return as_history(self._with_views(as_frames(observation), length), length)
+        return self._with_views(observation)
+
+    def _with_views(self, observation: RobotObservation, history: int = 1) -> RobotObservation:
+        """Return frames (T B, ...) with depth in metres and views; T, the `history`, are of the same camera."""
         observation = self._depth.in_metres(self._own_names(observation))
         is_augmented = self.augmentation > 0 and self._is_training
         if is_augmented:
@@ -122,7 +133,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
             self._check(self._batches(observation, missing))
             self._checked = True
         if is_augmented:
-            observation = augment(observation, self._observed.values(), self.augmentation)
+            observation = augment(observation, self._observed.values(), self.augmentation, history)
         if not missing:
             return observation
         batches = self._batches(observation, missing)

@@ -15,7 +15,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_policy_symview import SymviewBcConfig, SymviewEnvConfig, SymviewSacfdConfig
+from lerobot_policy_symview import SymviewBcConfig, SymviewEnvConfig, SymviewFlowConfig, SymviewSacfdConfig
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
 from lerobot_symview.datasets.add_views import AddViewsConfig
 from lerobot_symview.runtime.cli import USAGE, run_command
@@ -51,9 +51,19 @@ WRONG = {
         "check_camera": ("perhaps", "check_camera.*'perhaps'"),
         "normalization_mapping": ({"STATE": "MIN_MAX"}, "--policy.normalization_mapping must be IDENTITY for STATE"),
         "learning_rate_decay": ("linear", "learning_rate_decay.*'linear'.*cosine"),
+        "horizon": (1000, "--policy.horizon must lie between 1 and 256, got 1000"),
+        "n_action_steps": (2, "--policy.n_action_steps must be at least 1 and at most --policy.horizon=1, got 2"),
+        "drop_n_last_frames": (-1, "--policy.drop_n_last_frames must not be negative, got -1"),
+        "action_mode": ("relative", "action_mode.*'relative'.*absolute"),
+        "denoiser_width": (0, "--policy.denoiser_width must lie between 1 and 4096, got 0"),
         "aperture_noise": (NAN, "--policy.aperture_noise must be finite and at least 0, got nan"),
     },
+    "symview_flow": {
+        "n_obs_steps": (0, "--policy.n_obs_steps must lie between 1 and 8, got 0"),
+        "integration_steps": (0, "--policy.integration_steps must lie between 1 and 100, got 0"),
+    },
     "symview_sacfd": {
+        "n_obs_steps": (2, "--policy.n_obs_steps must be 1 for symview_sacfd, got 2"),
         "discount": (0.0, "--policy.discount must be above 0 and at most 1, got 0.0"),
         "bc_weight": (-1.0, "--policy.bc_weight must not be negative, got -1.0"),
         "initial_temperature": (0.0, "--policy.initial_temperature must be positive, got 0.0"),
@@ -145,8 +155,9 @@ class Empty:
 
 
 def test_every_option_has_a_wrong_value_here():
-    cloning, learning = WRONG["symview_bc"], WRONG["symview_sacfd"]
+    cloning, flow, learning = WRONG["symview_bc"], WRONG["symview_flow"], WRONG["symview_sacfd"]
     assert {*cloning, *FREE} == set(options(SymviewBcConfig(device="cpu"), PreTrainedConfig))
+    assert {*cloning, *flow, *FREE} >= set(options(SymviewFlowConfig(device="cpu"), PreTrainedConfig))
     assert {*cloning, *learning, *FREE} >= set(options(SymviewSacfdConfig(device="cpu"), PreTrainedConfig))
     assert set(WRONG["symview"]) == set(options(SymviewEnvConfig(), EnvConfig))
 

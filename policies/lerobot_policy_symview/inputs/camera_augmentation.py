@@ -18,8 +18,10 @@ DEPTH_NOISE, DROPOUT = 0.0025, 0.05  # standard deviation at 1 m, metres, and sh
 HIDDEN_SIDE = 0.3  # largest side of the hidden rectangle, relative to the image's
 
 
-def augment(observation: Mapping[str, Tensor], cameras: Iterable[ObservedCamera], strength: float) -> dict[str, Tensor]:
-    """Return observations as of worse cameras; every frame has its own errors, drawn from PyTorch's random numbers.
+def augment(
+    observation: Mapping[str, Tensor], cameras: Iterable[ObservedCamera], strength: float, history: int = 1
+) -> dict[str, Tensor]:
+    """Return observations as of worse cameras; every sample has its own errors, drawn from PyTorch's random numbers.
 
     The stated position is off by up to 1 cm, the orientation by up to 1 degree and the focal length by up to 1 %, in
     random directions; depth has noise of 2.5 mm at 1 m, which grows with its square, and lacks 5 % of its pixels; in
@@ -30,21 +32,27 @@ def augment(observation: Mapping[str, Tensor], cameras: Iterable[ObservedCamera]
         observation: images (B, C, H, W), colour in [0, 1] or uint8, depth in metres, and calibrations.
         cameras: whose images and calibration are changed.
         strength: of all errors.
+        history: T, where B frames are B / T samples with T observations each, all samples of a time together. The
+            calibration of a sample has one error.
     """
     changed = dict(observation)
     for camera in cameras:
         if keys.rgb(camera.name) not in observation or camera.missing_matrices(observation):
             continue
-        changed |= _stated(observation, camera, strength)
+        changed |= _stated(observation, camera, strength, history)
         changed |= _measured(observation, camera, strength)
     return changed
 
 
-def _stated(observation: Mapping[str, Tensor], camera: ObservedCamera, strength: float) -> dict[str, Tensor]:
+def _stated(
+    observation: Mapping[str, Tensor], camera: ObservedCamera, strength: float, history: int
+) -> dict[str, Tensor]:
     """Return the calibration of each frame, (B, N), with errors."""
-    rng = np.random.default_rng(int(torch.randint(2**62, ())))
+    seed = int(torch.randint(2**62, ()))
+    cameras = camera.cameras(observation)
     rows = []
-    for exact in camera.cameras(observation):
+    for index, exact in enumerate(cameras):
+        rng = np.random.default_rng([seed, index % (len(cameras) // history)])
         position, rotation_deg, focal = strength * rng.random(3) * (POSITION, ROTATION_DEG, FOCAL)
         rows.append(calibration_vectors(camera.name, Miscalibration(position, rotation_deg, focal).stated(exact, rng)))
     device = observation[keys.rgb(camera.name)].device

@@ -4,8 +4,9 @@ A head may contract the group axis G at once, as the linear heads do, or first a
 every group element's features.
 """
 
+from lerobot_policy_symview.nn.heads.flow import FlowHead
 from lerobot_policy_symview.nn.heads.gaussian import GaussianHead
 from lerobot_policy_symview.nn.heads.linear import EquivariantLinear
 from lerobot_policy_symview.nn.heads.regression import RegressionHead
 
-__all__ = ["EquivariantLinear", "GaussianHead", "RegressionHead"]
+__all__ = ["EquivariantLinear", "FlowHead", "GaussianHead", "RegressionHead"]

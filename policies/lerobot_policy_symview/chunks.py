@@ -1,0 +1,170 @@
+"""Base class of the policies that predict chunks of actions from one or several observations."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import deque
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_symview.configuration_chunks import ChunkConfig
+from lerobot_policy_symview.inputs.history import as_frames, history_length, stacked, with_length
+from lerobot_policy_symview.policy import MakeHead, Network, Stats, SymviewPolicy, scale_of
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_policy_symview.tracing import is_exporting
+from lerobot_symview import keys
+
+
+class ChunkPolicy(SymviewPolicy):
+    """Predicts trajectories relative to the gripper's present pose and carries out their first actions.
+
+    Training batches have actions (B, A), or chunks (B, H, A) with the flags `action_is_pad` (B, H); observations
+    (B, ...) or, with a history, (B, T, ...). The start of an episode repeats its first observation.
+
+    Args:
+        config: the policy's configuration.
+        make_head: makes the head on the features of all observations.
+        dataset_stats: minimum and maximum of states and actions in the dataset.
+    """
+
+    config: ChunkConfig
+    has_noise: ClassVar[bool]
+    """Whether chunks are made from noise."""
+
+    def __init__(self, config: ChunkConfig, make_head: MakeHead, dataset_stats: dict[str, dict[str, Any]] | None):
+        super().__init__(config, lambda fields, *others: make_head(config.n_obs_steps * fields, *others), dataset_stats)
+        self._observations: deque[dict[str, Tensor]] = deque(maxlen=config.n_obs_steps)
+        self._planned: deque[Tensor] = deque()
+
+    def action_scale(self, action: Stats | None, state: Stats | None) -> tuple[Tensor, Tensor]:
+        """Return centre and half-width, (A,) or (H, A), of the trajectories."""
+        config = self.config
+        if action is not None:
+            return config.trajectories.scale(action, state, config.horizon)
+        center, width = scale_of(None, config.actions)
+        times = (config.horizon, 1) if config.horizon > 1 else (1,)
+        return center.repeat(times), width.repeat(times)
+
+    @abstractmethod
+    def scaled_chunk(self, network: Network, features: Tensor, noise: Tensor) -> Tensor:
+        """Return scaled trajectories (B, H, A) for features (B, G, T n); the network is the trained or averaged one."""
+
+    @abstractmethod
+    def errors(self, features: Tensor, chunk: Tensor, is_pad: Tensor | None) -> Tensor:
+        """Return the losses (B,) for features (B, G, T n) and scaled trajectories (B, H, A)."""
+
+    def reset(self) -> None:
+        """Start an episode: forget the observations and the planned actions."""
+        super().reset()
+        self._observations.clear()
+        self._planned.clear()
+
+    @property
+    def history_length(self) -> int:
+        """Number of observations that the network sees."""
+        return self.config.n_obs_steps
+
+    def transform_actions(self, actions: Tensor, transform: PlanarTransform) -> Tensor:
+        """Return actions (B, A) for transformed scenes."""
+        return self.config.trajectories.transform(actions, transform)
+
+    def draw_noise(self, samples: int, generator: torch.Generator | None = None) -> Tensor:
+        """Return noise (B, H, A) for chunks, drawn from PyTorch's random numbers or those of a generator."""
+        center, config = self.action_center, self.config
+        shape = (samples, config.horizon, len(config.action_symmetry))
+        noise = torch.randn(shape, generator=generator, dtype=center.dtype) if self.has_noise else torch.zeros(shape)
+        return noise.to(center)
+
+    def forward(
+        self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Return the loss, mean or (B,), and no metrics: reading a number makes every step wait for a GPU."""
+        state, actions, is_pad = self._present_state(batch), batch[keys.ACTION], batch.get(f"{keys.ACTION}_is_pad")
+        actions = actions if actions.ndim == 3 else actions[:, None]
+        transform, crop_offset = None, None
+        if self.training:
+            transform, crop_offset = self.random_transform(state), torch.rand(len(state), 2, device=state.device)
+        if transform is not None:
+            chunks = [self.config.trajectories.transform(action, transform) for action in actions.unbind(1)]
+            actions = torch.stack(chunks, dim=1)
+            state = self.config.states.transform(state, transform, absolute_yaw=True)
+        chunk = self.scaled(self.config.trajectories.relative(actions, state, is_pad))
+        errors = self.errors(self._features(self.network, batch, transform, crop_offset), chunk, is_pad)
+        return (errors if reduction == "none" else errors.mean()), {}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **kwargs: Any) -> Tensor:
+        """Return the next H actions (B, H, A) in physical units, in the declared order.
+
+        Args:
+            batch: observations (B, ...), or with a history (B, T, ...); a shorter history repeats its first one.
+            noise: (B, H, A), from which chunks are made; by default it is drawn.
+            **kwargs: LeRobot's, not used.
+
+        Raises:
+            DivergenceError: if an action is not finite.
+            CalibrationError: as `select_action`.
+        """
+        self.eval()
+        state = self._present_state(batch)
+        self.check_first_image(batch)
+        noise = self.draw_noise(state.shape[0]) if noise is None else noise
+        network = self.averaged or self.network
+        with self.precision():
+            scaled = self.scaled_chunk(network, self._features(network, batch), noise)
+        actions = self.config.trajectories.actions_of(self.physical(scaled.to(state.dtype)), state)
+        if not is_exporting():  # an exported program has no branches on values
+            self.check_action(actions.flatten(0, 1), batch)
+        return actions
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], noise: Tensor | None = None, **kwargs: Any) -> Tensor:
+        """Return the action (B, A) for the observations (B, ...) that follow those of the last call.
+
+        A chunk is predicted whenever all of its actions that are to be carried out have been.
+
+        Raises:
+            DivergenceError: if an action is not finite.
+            CalibrationError: with `check_camera`, if the first image shows something else than the demonstrations.
+        """
+        if self.config.is_reactive:
+            return self.predict_action_chunk(batch, noise=noise)[:, 0]
+        self._observations.append(dict(batch))
+        if not self._planned:
+            chunk = self.predict_action_chunk(stacked(self._observations), noise=noise)
+            self._planned.extend(chunk[:, : self.config.n_action_steps].unbind(1))
+        return self._planned.popleft()
+
+    def _features(
+        self,
+        network: Network,
+        batch: dict[str, Tensor],
+        transform: PlanarTransform | None = None,
+        crop_offset: Tensor | None = None,
+    ) -> Tensor:
+        """Return the features (B, G, T n) of all observations of the samples."""
+        frames, count = self._frames(batch), self.history_length
+        if count == 1:
+            return network.encoder(*self.network_input(frames, transform, crop_offset))
+        if transform is not None:
+            transform = transform.repeated(count)
+        if crop_offset is not None:
+            crop_offset = crop_offset.repeat(count, 1)
+        features = network.encoder(*self.network_input(frames, transform, crop_offset))
+        history = features.view(count, -1, *features.shape[1:])
+        return history.permute(1, 2, 0, 3).flatten(2)
+
+    def _frames(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return T B frames; a history that is too short repeats its first observation."""
+        count = self.history_length
+        length = history_length(batch)
+        if length is None and count == 1:
+            return batch
+        return as_frames(with_length(batch if length else stacked([batch]), count))
+
+    def _present_state(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return the latest states (B, N) of the samples."""
+        state = batch[keys.STATE]
+        return state if state.ndim == 2 else state[:, -1]

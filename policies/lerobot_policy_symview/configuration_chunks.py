@@ -1,0 +1,66 @@
+"""Configuration of policies that may see several observations and predict several actions at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.symmetry.trajectories import Trajectories
+
+MAX_HORIZON = 256
+
+
+@dataclass
+class ChunkConfig(SymviewConfig):
+    """A policy whose output is a chunk of actions: the trajectory relative to the gripper's present pose."""
+
+    n_obs_steps: int = 1
+    """Observations that the network sees: the present one and those before it."""
+    horizon: int = 1
+    """Actions that are predicted at once, the first of them for the present observation."""
+    n_action_steps: int = 1
+    """Actions of a prediction that are carried out before the next one."""
+    drop_n_last_frames: int = 0
+    """Frames at the end of every episode that no training sample starts at; actions after the end never count."""
+    action_mode: Literal["delta", "absolute"] = "delta"
+    """`delta`: an action moves the gripper from where it is. `absolute`: an action is where the gripper shall be, in
+    the state's coordinates."""
+    denoiser_width: int = 256
+    """Hidden numbers per group element of the network that predicts chunks."""
+
+    def check(self) -> None:
+        """Check the fields of all policies and those of chunks."""
+        super().check()
+        self._check_choice("action_mode", ("delta", "absolute"))
+        for name, largest in {"n_obs_steps": 8, "horizon": MAX_HORIZON, "denoiser_width": 4096}.items():
+            if not 1 <= getattr(self, name) <= largest:
+                raise ValueError(f"--policy.{name} must lie between 1 and {largest}, got {getattr(self, name)}")
+        if not 1 <= self.n_action_steps <= self.horizon:
+            raise ValueError(
+                f"--policy.n_action_steps must be at least 1 and at most --policy.horizon={self.horizon}, got "
+                f"{self.n_action_steps}"
+            )
+        if self.drop_n_last_frames < 0:
+            raise ValueError(f"--policy.drop_n_last_frames must not be negative, got {self.drop_n_last_frames}")
+        _ = self.trajectories
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """What converts chunks of actions to relative trajectories and back."""
+        return Trajectories(self.actions, self.states, self.action_mode)
+
+    @property
+    def is_reactive(self) -> bool:
+        """Whether one observation determines one action."""
+        return self.n_obs_steps == self.horizon == 1
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:  # type: ignore[override]
+        """The frames of a sample's observations, relative to the present one."""
+        return None if self.n_obs_steps == 1 else list(range(1 - self.n_obs_steps, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int] | None:  # type: ignore[override]
+        """The frames of a sample's actions, relative to the present one."""
+        return None if self.horizon == 1 else list(range(self.horizon))

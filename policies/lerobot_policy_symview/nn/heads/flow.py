@@ -1,0 +1,138 @@
+"""Flow matching over action chunks (Lipman et al., 2023), equivariant by construction.
+
+A denoiser with shared weights is applied to every group element g, with the group axis as batch: it gets the noisy
+chunk in the frame of g, which is an equivariant lift to regular fields, and the features of g. Its outputs, brought
+back, are averaged. When the scene and the noise are transformed, so is the result.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+BLOCKS = 3
+OCTAVES = 6  # frequencies of the time's embedding
+NOISE_SAMPLES = 4  # noisy chunks per observation and step: the denoiser costs little beside the encoder
+
+
+class Denoiser(nn.Module):
+    """Residual network on a flattened chunk, conditioned on features and time; the velocity is zero at initialisation.
+
+    Args:
+        fields: F, numbers per group element of the features.
+        size: numbers of a chunk, H A.
+        width: of the hidden layers.
+    """
+
+    def __init__(self, fields: int, size: int, width: int):
+        super().__init__()
+        self.width = width
+        self.enter = nn.Linear(size, width)
+        self.condition = nn.Linear(fields, BLOCKS * width)
+        self.time = nn.Sequential(nn.Linear(2 * OCTAVES, width), nn.SiLU(), nn.Linear(width, BLOCKS * width))
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(BLOCKS))
+        self.widen = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(BLOCKS))
+        self.narrow = nn.ModuleList(nn.Linear(width, width) for _ in range(BLOCKS))
+        self.leave = nn.Linear(width, size)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)
+
+    def forward(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
+        """Return velocities (..., H A) of noisy chunks (..., H A).
+
+        Args:
+            chunk: in the frame of a group element.
+            condition: (..., BLOCKS width), `condition` of that element's features.
+            time: (..., BLOCKS width), `time_condition`.
+        """
+        hidden = self.enter(chunk)
+        conditions = torch.split(condition + time, self.width, dim=-1)
+        for norm, widen, narrow, shift in zip(self.norms, self.widen, self.narrow, conditions, strict=True):
+            hidden = hidden + narrow(functional.silu(widen(norm(hidden)) + shift))
+        velocity: Tensor = self.leave(functional.silu(hidden))
+        return velocity
+
+    def time_condition(self, time: Tensor) -> Tensor:
+        """Return the condition (..., BLOCKS width) of times (...) in [0, 1]."""
+        octaves = torch.arange(OCTAVES, device=time.device, dtype=time.dtype)
+        angles = math.pi * time[..., None] * 2**octaves
+        condition: Tensor = self.time(torch.cat([torch.cos(angles), torch.sin(angles)], dim=-1))
+        return condition
+
+
+class FlowHead(nn.Module):
+    """Transports Gaussian noise to scaled action chunks; without noise, it is a regression of chunks.
+
+    Args:
+        fields: F, numbers per group element of the features.
+        representation: (G, A, A), representation of the actions.
+        horizon: H, actions of a chunk.
+        width: of the denoiser.
+        has_noise: whether chunks start from noise; else from zeros, and one integration step is exact.
+    """
+
+    representation: Tensor
+
+    def __init__(self, fields: int, representation: NDArray, horizon: int, width: int, has_noise: bool = True):
+        super().__init__()
+        matrices = torch.tensor(representation, dtype=torch.get_default_dtype())
+        self.register_buffer("representation", matrices, persistent=False)
+        self.horizon, self.has_noise = horizon, has_noise
+        self.denoiser = Denoiser(fields, horizon * matrices.shape[-1], width)
+
+    def loss(self, features: Tensor, chunk: Tensor, is_pad: Tensor | None = None) -> Tensor:
+        """Return the mean squared errors (B,) of velocities on the straight paths from noise to chunks.
+
+        Args:
+            features: (B, G, F).
+            chunk: (B, H, A), scaled.
+            is_pad: (B, H) bool, actions that do not count.
+        """
+        samples = NOISE_SAMPLES if self.has_noise else 1
+        target = chunk.expand(samples, *chunk.shape)
+        noise = torch.randn_like(target) if self.has_noise else torch.zeros_like(target)
+        shape = (*target.shape[:2], 1, 1)
+        time = torch.rand(shape, device=chunk.device, dtype=chunk.dtype) if self.has_noise else target.new_zeros(shape)
+        velocity = self._velocity(torch.lerp(noise, target, time), self._condition(features), time[..., 0, 0])
+        errors = (velocity - (target - noise)).square().mean(dim=(0, 3))
+        if is_pad is None:
+            return errors.mean(dim=1)
+        counted = ~is_pad
+        return (errors * counted).sum(dim=1) / counted.sum(dim=1).clamp(min=1)
+
+    def forward(self, features: Tensor, noise: Tensor, steps: int = 1) -> Tensor:
+        """Return chunks (B, H, A) by Euler's method.
+
+        Args:
+            features: (B, G, F).
+            noise: (B, H, A), standard normal; zeros where chunks have no noise.
+            steps: of the integration.
+        """
+        condition = self._condition(features)
+        chunk = noise
+        for step in range(steps):
+            chunk = chunk + self._velocity(chunk, condition, chunk.new_full((len(chunk),), step / steps)) / steps
+        return chunk
+
+    def _condition(self, features: Tensor) -> Tensor:
+        condition: Tensor = self.denoiser.condition(features)
+        return condition
+
+    def _velocity(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
+        """Return velocities (..., B, H, A) of noisy chunks (..., B, H, A) at times (..., B).
+
+        Args:
+            chunk: noisy chunks.
+            condition: (B, G, C), of the features.
+            time: in [0, 1].
+        """
+        with torch.autocast(chunk.device.type, enabled=False):  # rho(g)^-1 is its transpose
+            lifted = torch.einsum("gba,...hb->...gha", self.representation, chunk)
+        velocity = self.denoiser(lifted.flatten(-2), condition, self.denoiser.time_condition(time)[..., None, :])
+        with torch.autocast(chunk.device.type, enabled=False):
+            velocity = velocity.to(chunk.dtype).unflatten(-1, chunk.shape[-2:])
+            return torch.einsum("gab,...ghb->...ha", self.representation, velocity) / len(self.representation)

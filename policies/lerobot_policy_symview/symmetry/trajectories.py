@@ -1,0 +1,150 @@
+"""Action chunks as trajectories relative to the gripper's pose at their start, and the scales of these trajectories.
+
+The dimensions `x`, `y`, `z`, `yaw`, `rx` and `ry` of an action move the gripper; the others, such as the aperture, keep
+their values. The pose after action k relative to the start is the sum of the first k increments, or the difference
+between an absolute target and the state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_symview.symmetry.representations import SMALLEST_EXTENT, VectorRepresentation
+from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+
+ActionMode = Literal["delta", "absolute"]
+MOVING = ("x", "y", "z", "yaw", "rx", "ry")
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Converts chunks of actions to relative trajectories and back, in the order of the action's dimensions.
+
+    Args:
+        actions: how an action's dimensions transform.
+        states: how a state's dimensions transform.
+        mode: `delta` if an action moves the gripper from where it is, `absolute` if it says where the gripper shall be,
+            in the state's coordinates.
+
+    Raises:
+        ValueError: if absolute actions have a dimension that moves the gripper and that the state lacks, or a rotation
+            vector, whose relative rotation is not a difference.
+    """
+
+    actions: VectorRepresentation
+    states: VectorRepresentation
+    mode: ActionMode = "delta"
+
+    def __post_init__(self) -> None:
+        if self.mode == "delta":
+            return
+        labels = [self.actions.dimensions[i] for i in self.moving]
+        missing = [label for label in labels if label not in self.states.dimensions]
+        if missing:
+            raise ValueError(
+                f"--policy.action_mode=absolute needs the gripper's {', '.join(missing)} in {self.states.flag}, got "
+                f"{list(self.states.dimensions)}"
+            )
+        if self.actions.of_type("rx"):
+            raise ValueError(
+                "--policy.action_mode=absolute does not support rotation vectors (rx, ry): record increments of the "
+                "rotation, or declare its dimensions as scalar"
+            )
+
+    @cached_property
+    def moving(self) -> list[int]:
+        """Indices of the action's dimensions that move the gripper."""
+        return sorted(index for kind in MOVING for index in self.actions.of_type(kind))
+
+    def relative(self, actions: Tensor, state: Tensor, is_pad: Tensor | None = None) -> Tensor:
+        """Return the trajectories (B, H, A) of chunks of actions.
+
+        Args:
+            actions: (B, H, A), metres and radians.
+            state: (B, N) at the start.
+            is_pad: (B, H) bool, the actions after the end of an episode; there, the gripper stays where it is.
+        """
+        trajectory = actions.clone()
+        moving = actions[..., self.moving]
+        if self.mode == "absolute":
+            trajectory[..., self.moving] = self._nearest(moving - self._start(state)[:, None])
+            return trajectory
+        if is_pad is not None:
+            moving = torch.where(is_pad[..., None], torch.zeros_like(moving), moving)
+        trajectory[..., self.moving] = moving.cumsum(dim=1)
+        return trajectory
+
+    def actions_of(self, trajectory: Tensor, state: Tensor) -> Tensor:
+        """Return the chunks of actions (B, H, A) of trajectories (B, H, A) that start at states (B, N)."""
+        actions = trajectory.clone()
+        moving = trajectory[..., self.moving]
+        if self.mode == "absolute":
+            actions[..., self.moving] = moving + self._start(state)[:, None]
+        else:
+            actions[..., self.moving] = torch.diff(moving, dim=1, prepend=torch.zeros_like(moving[:, :1]))
+        return actions
+
+    def transform(self, actions: Tensor, transform: PlanarTransform) -> Tensor:
+        """Return actions (B, A) for transformed scenes."""
+        return self.actions.transform(actions, transform, absolute_yaw=self.mode == "absolute")
+
+    def scale(self, action: Mapping[str, Any], state: Mapping[str, Any] | None, horizon: int) -> tuple[Tensor, Tensor]:
+        """Return centre and half-width of the trajectories, by which scaling is equivariant.
+
+        A single action is scaled by its range. In a longer chunk, the displacement after k increments is at most k
+        times the largest one, and at most the range of the states.
+
+        Args:
+            action: `min` and `max` (A,) of the actions in the dataset.
+            state: `min` and `max` (N,) of the states, where they are known.
+            horizon: H.
+
+        Returns:
+            (A,) each if H is 1, else (H, A) each.
+        """
+        ends = [torch.as_tensor(action[end], dtype=torch.float32) for end in ("min", "max")]
+        center, width = self.actions.scale(*ends)
+        if horizon == 1 and self.mode == "delta":
+            return center, width
+        extent = torch.maximum(ends[0].abs(), ends[1].abs())
+        reach = self._ranges(state, ends)
+        for pair in self.actions.pairs:
+            extent[list(pair)], reach[list(pair)] = extent[list(pair)].max(), reach[list(pair)].max()
+        steps = torch.arange(1, horizon + 1)[:, None]
+        largest = torch.full_like(extent, math.inf) if self.mode == "absolute" else extent
+        moving = torch.minimum(steps * largest, reach)
+        center, width = center.repeat(horizon, 1), width.repeat(horizon, 1)
+        center[:, self.moving] = 0.0
+        width[:, self.moving] = moving[:, self.moving].clamp(min=SMALLEST_EXTENT)
+        return (center[0], width[0]) if horizon == 1 else (center, width)
+
+    def _ranges(self, state: Mapping[str, Any] | None, action_ends: list[Tensor]) -> Tensor:
+        """Return the largest displacement (A,) that the ranges allow; infinite where they say nothing."""
+        ranges = torch.full_like(action_ends[0], math.inf)
+        for index in self.moving:
+            label = self.actions.dimensions[index]
+            if self.mode == "absolute":
+                ranges[index] = action_ends[1][index] - action_ends[0][index]
+            elif state is not None and label in self.states.dimensions:
+                column = self.states.dimensions.index(label)
+                ranges[index] = torch.as_tensor(state["max"])[column] - torch.as_tensor(state["min"])[column]
+        return torch.where(ranges > SMALLEST_EXTENT, ranges, torch.full_like(ranges, math.inf))
+
+    def _start(self, state: Tensor) -> Tensor:
+        """Return the gripper's pose in the moving dimensions."""
+        return state[:, [self.states.dimensions.index(self.actions.dimensions[i]) for i in self.moving]]
+
+    def _nearest(self, displacement: Tensor) -> Tensor:
+        """Return displacements (..., M) with yaw differences in [-pi, pi)."""
+        nearest = displacement.clone()
+        for place, index in enumerate(self.moving):
+            if self.actions.dimensions[index].split(":")[0] == "yaw":
+                nearest[..., place] = (displacement[..., place] + math.pi) % (2 * math.pi) - math.pi
+        return nearest
