@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 
 from lerobot_symview.geometry.camera import Array
 from symview_sim.bullet import pybullet, silenced
+from symview_sim.control import Control
 from symview_sim.motions import yaw_difference
 from symview_sim.robots import RobotSpec
 
-ARM_STEPS, GRIPPER_STEPS = 40, 25  # simulation steps of 1/240 s: 0.27 s per action
-RAMP_STEPS = 27  # the joint targets reach the goal in these of the ARM_STEPS; the arm settles in the others
 POSITION_GAIN = 0.2
 # Steel on wood. With more friction the fingers jam on a cube's corners instead of aligning it: at 1.0 a cube grasped 35
 # degrees askew stays askew, at 0.2 it slips out.
@@ -44,9 +43,10 @@ def _load(client: Any, spec: RobotSpec) -> int:
 class Arm:
     """A robot in one PyBullet client. At yaw 0 the fingers open along world x; yaw is in [-pi/2, pi/2)."""
 
-    def __init__(self, client: Any, spec: RobotSpec):
+    def __init__(self, client: Any, spec: RobotSpec, control: Control):
         self._client = client
         self._spec = spec
+        self._control = control
         self.body = _load(client, spec)
         self._joints = list(range(len(spec.home)))
         self._gripper_joints = list(spec.gripper_joints)
@@ -84,19 +84,20 @@ class Arm:
     def move(self, position: ArrayLike, yaw: float, aperture: float) -> None:
         """Move the gripper to `position` (3,) metres and `yaw`, rad, then open it to `aperture` in [0, 1].
 
-        The number of simulation steps is always the same.
+        The number of simulation steps is always the control's.
         """
         simulate = self._client.stepSimulation
         start = np.array([state[0] for state in self._client.getJointStates(self.body, self._joints)])
         goal = np.array(self._solve(position, yaw))
-        progress = np.arange(1, RAMP_STEPS + 1)[:, None] / RAMP_STEPS
+        ramp = self._control.ramp_steps
+        progress = np.arange(1, ramp + 1)[:, None] / ramp
         for angles in (start + (goal - start) * progress).tolist():  # a sudden target would throw objects in the way
             self._command_arm(angles)
             simulate()
-        for _ in range(ARM_STEPS - RAMP_STEPS):
+        for _ in range(self._control.hold_steps):
             simulate()
         self._command_fingers(aperture)
-        for _ in range(GRIPPER_STEPS):
+        for _ in range(self._control.finger_steps):
             simulate()
 
     @property

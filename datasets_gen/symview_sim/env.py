@@ -12,7 +12,7 @@ from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
 from symview_sim.camera_rig import CameraImages, EnvObservation
-from symview_sim.motions import MAX_STEP, MAX_YAW_STEP
+from symview_sim.control import CONTROLS
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
@@ -28,14 +28,14 @@ GRIPPER_HEIGHTS = (0.02, 0.25)  # metres, limits of the gripper's z; below 2 cm 
 class SymviewEnv(TableEnv):
     """A tabletop manipulation task in PyBullet; observations are those of `TableEnv`.
 
-    Action: (5,) float32: dx, dy, dz (metres, each clamped to 0.05), dyaw (radians, clamped to pi/4), aperture in
-    [0, 1].
+    Action: (5,) float32: dx, dy, dz (metres, each clamped to 0.05, or 0.015 with fine control), dyaw (radians, clamped
+    to pi/4, or pi/12), aperture in [0, 1].
     State: (5,) gripper x, y (metres, relative to the workspace centre), z (metres), yaw (radians), aperture.
     Labels: 0 table, 1 robot, 2 and up objects.
     Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` is the same as a bool.
     Start: gripper open, 20 cm above the workspace centre; objects at random poses; cameras with a spread at a new
     random pose.
-    End: success, an object out of reach, or `max_steps` actions.
+    End: success, an object out of reach, or `episode_steps` actions.
 
     Args:
         settings: task, robot, workspace, cameras and limits.
@@ -50,7 +50,8 @@ class SymviewEnv(TableEnv):
 
     def __init__(self, settings: EnvSettings, render_mode: str | None = "rgb_array"):
         self.episode_task = make_task(settings.task)
-        limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_YAW_STEP], dtype=np.float32)
+        self._control = CONTROLS[settings.control]
+        limits = self._control.limits.astype(np.float32)
         low, high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         super().__init__(settings, self.episode_task.instruction, low, high, render_mode)
         self._robot = lookup("robot", settings.robot, ROBOTS)
@@ -63,7 +64,7 @@ class SymviewEnv(TableEnv):
     def scene(self) -> Scene:
         """The simulator. It starts at first use, so that an environment costs nothing before its first reset."""
         if self._scene is None:
-            self._scene = Scene(self._robot, self.workspace)
+            self._scene = Scene(self._robot, self.workspace, self._control)
         return self._scene
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[EnvObservation, dict]:
@@ -98,7 +99,7 @@ class SymviewEnv(TableEnv):
 
     def expert_action(self) -> NDArray[np.float32]:
         """Return the expert's action in the current state, (5,) float32."""
-        return self.episode_task.expert_action(self.scene).astype(np.float32)
+        return self._control.planned(self.episode_task.expert_action(self.scene)).astype(np.float32)
 
     def close(self) -> None:
         """Shut the simulator down."""

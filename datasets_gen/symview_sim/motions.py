@@ -6,8 +6,6 @@ import numpy as np
 
 from lerobot_symview.geometry.camera import Array
 
-MAX_STEP = 0.05  # metres per action and axis
-MAX_YAW_STEP = np.pi / 4  # radians per action
 ALIGNED_YAW = 0.1  # radians
 
 
@@ -19,17 +17,15 @@ def yaw_difference(yaw_from: float, yaw_to: float, period: float) -> float:
     return float((yaw_to - yaw_from + period / 2) % period - period / 2)
 
 
-def step_towards(position: Array, goal: Array, yaw_change: float) -> tuple[Array, bool]:
-    """Return the motion (4,) dx, dy, dz, dyaw of one action, and whether it reaches the goal.
+def motion_to(position: Array, goal: Array, yaw_change: float) -> Array:
+    """Return the motion (4,) dx, dy, dz, dyaw that remains to be done; it may take several actions.
 
     Args:
         position: (3,) the gripper's, metres.
         goal: (3,) metres.
         yaw_change: rotation about z that remains to be done, rad.
     """
-    limits = np.array([MAX_STEP, MAX_STEP, MAX_STEP, MAX_YAW_STEP])
-    motion = np.append(np.asarray(goal) - position, yaw_change)
-    return np.clip(motion, -limits, limits), bool((np.abs(motion) <= limits).all())
+    return np.append(np.asarray(goal) - position, yaw_change)
 
 
 def _limited(displacement: Array, longest: float) -> Array:
@@ -37,8 +33,8 @@ def _limited(displacement: Array, longest: float) -> Array:
     return displacement * min(1.0, longest / max(np.abs(displacement).max(), 1e-9))
 
 
-def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, speed: float = MAX_STEP) -> Array:
-    """Return the next motion (4,) of a sweep along the table from `start` to `end`, approached from above `start`.
+def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, step: float) -> Array:
+    """Return the remaining motion (4,) of a sweep along the table from `start` to `end`, approached from above `start`.
 
     The gripper's position alone decides: low and on the line, continue to `end`; above `start`, descend; otherwise, go
     to 10 cm above `start`. The fingers' opening axis stays perpendicular to the sweep.
@@ -49,7 +45,7 @@ def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, 
         start: (2,) metres.
         end: (2,) metres.
         height: of the gripper above the table during the sweep, metres.
-        speed: largest step per axis during the sweep, metres.
+        step: largest motion per axis of an action during the sweep, metres.
     """
     along = (end - start) / np.linalg.norm(end - start)
     yaw_change = yaw_difference(yaw, np.arctan2(along[0], -along[1]), period=np.pi)
@@ -57,8 +53,8 @@ def sweep(position: Array, yaw: float, start: Array, end: Array, height: float, 
     ahead, aside = offset @ along, abs(offset @ np.array([-along[1], along[0]]))
     is_low = position[2] < height + 0.015
     if is_low and aside < 0.02 and ahead > -0.02:
-        motion, _ = step_towards(position, np.array([*end, height]), yaw_change)
-        motion[:2] = _limited(end - position[:2], speed)
+        motion = motion_to(position, np.array([*end, height]), yaw_change)
+        motion[:2] = _limited(motion[:2], step)
         return motion
     is_above = np.abs(offset).max() < 0.015 and abs(yaw_change) < ALIGNED_YAW
-    return step_towards(position, np.array([*start, height if is_above else height + 0.1]), yaw_change)[0]
+    return motion_to(position, np.array([*start, height if is_above else height + 0.1]), yaw_change)

@@ -13,6 +13,7 @@ from lerobot_symview.geometry.camera import Array
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.arm import Arm
 from symview_sim.bullet import connect, disconnect, pybullet
+from symview_sim.control import Control
 from symview_sim.robots import RobotSpec
 from symview_sim.shapes import Part, Vector
 
@@ -32,18 +33,19 @@ class Scene:
     Args:
         robot: the robot arm.
         workspace: the working area of the task.
+        control: the rate and the limits of the actions.
     """
 
-    def __init__(self, robot: RobotSpec, workspace: Workspace):
+    def __init__(self, robot: RobotSpec, workspace: Workspace, control: Control):
         self.client: Any = connect()
         self.client.setAdditionalSearchPath(pybullet_data.getDataPath())
         self._disconnect = weakref.finalize(self, disconnect, self.client)
-        self.workspace = workspace
+        self.workspace, self.control = workspace, control
         self.client.setGravity(0, 0, GRAVITY)
         self.client.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
         ground = self.client.createMultiBody(0, self.client.createCollisionShape(pybullet.GEOM_PLANE))
         self.client.changeVisualShape(ground, -1, rgbaColor=[1, 1, 1, 0])
-        self.arm = Arm(self.client, robot)
+        self.arm = Arm(self.client, robot, control)
         self.arm.pass_through(ground)  # no arm reaches under the table; the collision test takes a quarter of a step
         self._fixtures: int = self.client.getNumBodies()
         # The first simulation step leaves a state in the solver. After it, episodes are bit-identical in whatever order

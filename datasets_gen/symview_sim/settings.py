@@ -16,6 +16,7 @@ from lerobot_symview.geometry.placement import CameraSpec, top_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import DatasetLocation
+from symview_sim.control import CONTROLS
 from symview_sim.robots import ROBOTS
 from symview_sim.tasks import TASK_NAMES, check_task
 
@@ -46,8 +47,8 @@ class WorldSettings(ABC):
     """Add each camera's depth image, in metres."""
     workspace: Workspace = field(default_factory=Workspace)
     """The working area on the table."""
-    max_steps: int = 50
-    """Actions per episode."""
+    max_steps: int | None = None
+    """Actions per episode; without a number, the simulator's own."""
 
     state_names: ClassVar[Sequence[str]] = keys.STATE_NAMES
     action_names: ClassVar[Sequence[str]] = keys.ACTION_NAMES
@@ -59,7 +60,7 @@ class WorldSettings(ABC):
 
     def check(self) -> None:
         """Raise an OptionError unless the settings describe an environment."""
-        if self.max_steps < 1:
+        if self.max_steps is not None and self.max_steps < 1:
             raise OptionError(f"max_steps must be at least 1, got {self.max_steps}")
         names = [spec.name for spec in self.all_cameras]
         if len(set(names)) < len(names):
@@ -89,6 +90,11 @@ class WorldSettings(ABC):
     def actions_per_second(self) -> int:
         """Actions per second of the simulated robot."""
 
+    @property
+    @abstractmethod
+    def episode_steps(self) -> int:
+        """Largest number of actions of an episode."""
+
     @abstractmethod
     def make(self) -> TableEnv:
         """Return a new environment. The simulator is imported only now.
@@ -116,7 +122,7 @@ class EnvSettings(WorldSettings):
     """A task, a robot arm, the workspace and the cameras of a PyBullet environment.
 
     Raises:
-        OptionError: as `WorldSettings`, or if the task or robot is unknown.
+        OptionError: as `WorldSettings`, or if the task, robot or control is unknown.
     """
 
     task: str = "block_picking"
@@ -127,6 +133,9 @@ class EnvSettings(WorldSettings):
     """Add the camera `top`, which looks straight down and does not see the arm."""
     segmentation: bool = False
     """Add each camera's segmentation: 0 table, 1 robot, 2 and up the objects."""
+    control: str = "coarse"
+    """`coarse`: 4 actions a second, each at most 5 cm and 45 degrees, 50 an episode; `fine`: 10 a second, 1.5 cm and 15
+    degrees, 200 an episode."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
 
@@ -137,6 +146,7 @@ class EnvSettings(WorldSettings):
         try:
             check_task(self.task)
             lookup("robot", self.robot, ROBOTS)
+            lookup("control", self.control, CONTROLS)
         except ValueError as error:
             raise OptionError(str(error)) from None
         if not 0 <= self.start_jitter < math.inf:
@@ -162,7 +172,12 @@ class EnvSettings(WorldSettings):
     @property
     def actions_per_second(self) -> int:
         """Actions per second: the simulated robot's speed."""
-        return 4
+        return CONTROLS[self.control].actions_per_second
+
+    @property
+    def episode_steps(self) -> int:
+        """Largest number of actions of an episode."""
+        return self.max_steps or CONTROLS[self.control].max_steps
 
     def make(self) -> SymviewEnv:
         """Return a new environment. PyBullet is imported only now."""

@@ -52,7 +52,7 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self.task, self.task_description = settings.task, instruction
         self.metadata = self.metadata | {"render_fps": settings.actions_per_second}
         self.render_mode = render_mode
-        self._max_episode_steps = settings.max_steps  # LeRobot reads it under this name
+        self._max_episode_steps = settings.episode_steps  # LeRobot reads it under this name
         self.specs = settings.all_cameras
         shown = {"depth": settings.depth, "segmentation": settings.has_labels}
         self._rig = CameraRig(self.specs, self.workspace, self._draw, self._place, **shown)

@@ -54,6 +54,16 @@ def test_preprocessor_adds_the_views():
     env.close()
 
 
+def test_fine_control_gives_lerobot_its_rate_and_episode_length():
+    config = SymviewEnvConfig(camera=SMALL, control="fine")
+    env = config.create_envs(2)["block_picking"][0]
+    assert (config.fps, env.call("_max_episode_steps")) == (10, (200, 200))
+    assert env.single_action_space.high[0] == pytest.approx(0.015)
+    with pytest.raises(FlagError, match=r"--env\.fps=4: the simulator takes 10 actions a second"):
+        SymviewEnvConfig(control="fine", fps=4)
+    env.close()
+
+
 def test_view_that_needs_depth_raises_without_depth():
     with pytest.raises(FlagError, match="'reproj' needs depth"):
         SymviewEnvConfig(depth=False, views=["reproj"])

@@ -262,13 +262,15 @@ def test_the_expert_succeeds(task, robot):
     assert np.mean(lengths) <= 1.2 * REFERENCE_LENGTHS[task]
 
 
-def test_actions_are_clamped_to_the_action_space():
-    env = EnvSettings("block_picking").make()
+@pytest.mark.parametrize(("control", "step", "yaw_step"), [("coarse", 0.05, np.pi / 4), ("fine", 0.015, np.pi / 12)])
+def test_actions_are_clamped_to_the_action_space(control, step, yaw_step):
+    env = EnvSettings("block_picking", control=control).make()
     before, _ = env.reset(seed=0)
     after, *_ = env.step(np.array([1.0, -1.0, 0.0, 10.0, 1.0]))
     moved = after["agent_pos"] - before["agent_pos"]
-    np.testing.assert_allclose(moved[:3], [0.05, -0.05, 0.0], atol=0.004)
-    assert moved[3] == pytest.approx(np.pi / 4, abs=0.03)
+    np.testing.assert_allclose(moved[:3], [step, -step, 0.0], atol=0.004)
+    assert moved[3] == pytest.approx(yaw_step, abs=0.03)
+    assert env.metadata["render_fps"] == env.settings.actions_per_second
 
 
 FINITE = [0.02, 0.0, 0.0, 0.0, 1.0]

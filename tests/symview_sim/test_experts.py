@@ -5,6 +5,8 @@ import pytest
 
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim import TASK_NAMES
+from symview_sim.control import CONTROLS, FINE
+from symview_sim.robots import ROBOTS
 from symview_sim.settings import EnvSettings
 
 TINY = CameraSpec(height=8, width=8)
@@ -40,16 +42,17 @@ class TransformedScene:
         return self.transformed(position), self.transformed_yaw(yaw)
 
 
+@pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.parametrize("reflect", [False, True], ids=["rotated", "reflected"])
 @pytest.mark.parametrize("task", TASK_NAMES)
-def test_experts_are_equivariant_to_rotations_and_reflections(task, reflect):
-    env = EnvSettings(task, camera=TINY, start_jitter=0.05).make()
+def test_experts_are_equivariant_to_rotations_and_reflections(task, reflect, control):
+    env = EnvSettings(task, control=control, camera=TINY, start_jitter=0.05).make()
     compared = 0
-    for seed in range(3):
+    for seed in range(3 if control == "coarse" else 1):
         env.reset(seed=seed)
         done = False
         while not done:
-            action = env.expert_action()
+            action = env.episode_task.expert_action(env.scene)
             for quarter_turns in range(4):
                 scene = TransformedScene(env.scene, quarter_turns, reflect)
                 np.testing.assert_allclose(
@@ -59,6 +62,23 @@ def test_experts_are_equivariant_to_rotations_and_reflections(task, reflect):
                     err_msg=f"seed {seed}",
                 )
                 compared += 1
-            _, _, terminated, truncated, _ = env.step(action)
+            _, _, terminated, truncated, _ = env.step(env.expert_action())
             done = terminated or truncated
     assert compared > 50
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_experts_solve_the_tasks_in_fine_actions(task, robot):
+    env = EnvSettings(task, robot=robot, control="fine", camera=TINY).make()
+    for seed in range(5):
+        env.reset(seed=seed)
+        done, steps = False, 0
+        while not done:
+            action = env.expert_action()
+            assert (np.abs(action[:4]) <= FINE.limits + 1e-7).all()
+            _, _, terminated, truncated, info = env.step(action)
+            done, steps = terminated or truncated, steps + 1
+        assert info["is_success"]
+        assert 25 <= steps <= 100

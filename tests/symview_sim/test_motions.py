@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from symview_sim.motions import MAX_STEP, MAX_YAW_STEP, step_towards, sweep, yaw_difference
+from symview_sim.control import COARSE
+from symview_sim.motions import motion_to, sweep, yaw_difference
 
 
 @pytest.mark.parametrize(
@@ -18,29 +19,26 @@ def test_a_reflection_changes_the_sign_of_a_yaw_difference():
         assert yaw_difference(-start, -goal, np.pi / 2) == pytest.approx(-yaw_difference(start, goal, np.pi / 2))
 
 
-def test_a_step_is_clamped_and_reports_arrival():
-    motion, arrives = step_towards(np.zeros(3), np.array([0.2, -0.01, 0.0]), yaw_change=2.0)
-    np.testing.assert_allclose(motion, [MAX_STEP, -0.01, 0.0, MAX_YAW_STEP])
-    assert not arrives
-    motion, arrives = step_towards(np.zeros(3), np.array([0.02, -0.01, 0.0]), yaw_change=0.1)
-    np.testing.assert_allclose(motion, [0.02, -0.01, 0.0, 0.1])
-    assert arrives
+def test_a_motion_is_the_whole_way_to_the_goal():
+    motion = motion_to(np.array([0.1, 0.0, 0.2]), np.array([0.3, -0.01, 0.2]), yaw_change=2.0)
+    np.testing.assert_allclose(motion, [0.2, -0.01, 0.0, 2.0])
 
 
+STEP = COARSE.step
 START, END, HEIGHT = np.array([0.05, -0.02]), np.array([-0.03, 0.10]), 0.03
 
 
 @pytest.mark.parametrize(
     ("position", "expected"),
-    [((0.0, 0.0, 0.2), (0.05, -0.02, -0.05)), ((0.05, -0.02, 0.13), (0.0, 0.0, -0.05)), ((0.05, -0.02, 0.03), None)],
+    [((0.0, 0.0, 0.2), (0.05, -0.02, -0.07)), ((0.05, -0.02, 0.13), (0.0, 0.0, -0.1)), ((0.05, -0.02, 0.03), None)],
     ids=["approach", "descend", "sweep"],
 )
 def test_the_phase_of_a_sweep_depends_on_the_grippers_position(position, expected):
     yaw = np.arctan2(*(END - START)[::-1]) + np.pi / 2
-    motion = sweep(np.array(position), yaw, START, END, HEIGHT)
+    motion = sweep(np.array(position), yaw, START, END, HEIGHT, STEP)
     if expected is None:  # straight along the line, no faster than the limit
         along = (END - START) / np.linalg.norm(END - START)
-        assert np.abs(motion[:2]).max() == pytest.approx(MAX_STEP)
+        assert np.abs(motion[:2]).max() == pytest.approx(STEP)
         np.testing.assert_allclose(motion[:2] / np.linalg.norm(motion[:2]), along)
     else:
         np.testing.assert_allclose(motion[:3], expected, atol=1e-9)
@@ -56,13 +54,14 @@ def test_a_sweep_is_equivariant_to_rotations_and_reflections(quarter_turns, refl
     for _ in range(30):
         start, end = rng.uniform(-0.2, 0.2, (2, 2))
         position, yaw = np.append(start + rng.normal(0, 0.03, 2), rng.choice([0.03, 0.13, 0.2])), rng.uniform(-1.5, 1.5)
-        motion = sweep(position, yaw, start, end, HEIGHT)
+        motion = sweep(position, yaw, start, end, HEIGHT, STEP)
         transformed = sweep(
             np.append(matrix @ position[:2], position[2]),
             reflection * yaw + angle,
             matrix @ start,
             matrix @ end,
             HEIGHT,
+            STEP,
         )
         np.testing.assert_allclose(transformed[:2], matrix @ motion[:2], atol=1e-9)
         np.testing.assert_allclose(transformed[2:], [motion[2], reflection * motion[3]], atol=1e-9)

@@ -7,6 +7,7 @@ from lerobot_symview.geometry.camera import project, unproject
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.views import Frame, make_view
 from symview_sim import bullet
+from symview_sim.control import COARSE
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
@@ -20,7 +21,7 @@ BOX = np.array([0.30, 0.24, 0.04])
 def scene():
     from lerobot_symview.geometry.workspace import Workspace
 
-    scene = Scene(ROBOTS["panda"], Workspace())
+    scene = Scene(ROBOTS["panda"], Workspace(), COARSE)
     scene.reset(np.array([0.3, 0.0, 0.24]), 0.0)
     scene.add_box(BOX, 0.0, 1.0, (0.9, 0.1, 0.1), np.array([0.45, 0.0, 0.02]), 0.0)
     return scene

@@ -33,6 +33,20 @@ def test_equal_settings_have_equal_hashes():
     assert EnvSettings(camera=SIDE) != EnvSettings(camera=LEFT)
 
 
+def test_the_control_sets_the_rate_and_the_length_of_an_episode():
+    coarse, fine = EnvSettings(), EnvSettings(control="fine")
+    assert (coarse.actions_per_second, coarse.episode_steps) == (4, 50)
+    assert (fine.actions_per_second, fine.episode_steps) == (10, 200)
+    assert replace(fine, max_steps=7).episode_steps == 7
+    assert replace(coarse, control="fine") == fine
+
+
+@pytest.mark.parametrize("kind", ["metaworld", "fetch"])
+def test_other_simulators_have_no_control(kind):
+    with pytest.raises(draccus.utils.DecodingError, match="`control` are not valid for Recorded"):
+        draccus.parse(GenerateConfig, args=[f"--env.type={kind}", "--env.control=fine"])
+
+
 def test_a_recording_has_the_oracle_by_default():
     assert [spec.name for spec in RecordedEnv(more_cameras=(LEFT,)).all_cameras] == ["side", "left", "top"]
     assert [spec.name for spec in EnvSettings().all_cameras] == ["side"]
@@ -66,6 +80,7 @@ def test_the_task_happens_in_the_workspace():
     [
         ({"task": "block_piking"}, "unknown task 'block_piking'.*did you mean 'block_picking'"),
         ({"robot": "pandas"}, "unknown robot 'pandas'.*did you mean 'panda'"),
+        ({"control": "fines"}, "unknown control 'fines'.*did you mean 'fine'"),
         ({"start_jitter": -0.1}, "start_jitter must not be negative, got -0.1"),
         ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
         ({"more_cameras": (SIDE,)}, "cameras must differ in their names, got side, side"),

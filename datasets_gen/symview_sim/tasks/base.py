@@ -34,4 +34,7 @@ class Task(ABC):
 
     @abstractmethod
     def expert_action(self, scene: Scene) -> Array:
-        """Return the expert's action (5,) in the current state: dx, dy, dz (m), dyaw (rad), aperture in [0, 1]."""
+        """Return the expert's action (5,) in the current state: dx, dy, dz (m), dyaw (rad), aperture in [0, 1].
+
+        The motion may be longer than an action; the environment shortens it to the speed of `scene.control`.
+        """

@@ -34,7 +34,7 @@ class BlockPicking(Task):
         return scene.within_reach(self._cube)
 
     def expert_action(self, scene: Scene) -> Array:
-        """Approach the cube in a straight line, close on arrival and lift it."""
+        """Approach the cube in a straight line, or from above in short actions, close on arrival and lift it."""
         if scene.arm.holds(self._cube):
             return np.append(LIFT, CLOSED)
         return grasp(scene, self._cube, from_above=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array
-from symview_sim.motions import MAX_STEP, sweep
+from symview_sim.motions import sweep
 from symview_sim.placing import random_places
 from symview_sim.scene import Scene
 from symview_sim.tasks.base import Task
@@ -14,7 +14,7 @@ SIZE = (0.08, 0.08, 0.05)
 BEHIND = 0.08  # metres behind the moved block where a sweep starts
 HEIGHT = 0.03
 TOUCHING = 0.002  # metres
-NEAR, GENTLE = 0.06, 0.02  # metres: blocks that are closer than NEAR are moved in steps of GENTLE
+NEAR, GENTLE = 0.06, 0.08  # metres, metres per second: blocks that are closer than NEAR are moved at GENTLE
 
 
 class BlockPulling(Task):
@@ -54,8 +54,9 @@ class BlockPulling(Task):
             lacking = round(float(np.linalg.norm(start - behind)), 2)
             options.append((lacking, np.linalg.norm(scene.arm.position[:2] - moved), start, other))
         _, _, start, other = min(options, key=lambda option: option[:2])
-        speed = GENTLE if scene.gap(self._blocks[0], self._blocks[1], longest=NEAR) < NEAR else MAX_STEP
-        return np.append(sweep(scene.arm.position, scene.arm.yaw, start, other, HEIGHT, speed), 1.0)
+        is_near = scene.gap(self._blocks[0], self._blocks[1], longest=NEAR) < NEAR
+        step = scene.control.step_at(GENTLE if is_near else scene.control.speed)
+        return np.append(sweep(scene.arm.position, scene.arm.yaw, start, other, HEIGHT, step), 1.0)
 
 
 TASK = BlockPulling

@@ -43,7 +43,8 @@ class BlockPushing(Task):
         cube, goal = scene.pose(self._cube)[0][:2], scene.pose(self._goal)[0][:2]
         along = (goal - cube) / np.linalg.norm(goal - cube)
         start = scene.clip_to_workspace(cube - BEHIND * along)
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, goal - SHORT * along, HEIGHT)
+        step = scene.control.step_at(scene.control.speed)
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, goal - SHORT * along, HEIGHT, step)
         return np.append(motion, 0.5)
 
 

@@ -14,7 +14,7 @@ from symview_sim.tasks.base import Task
 OPENED = 0.15  # metres
 TRAVEL = 0.2  # metres: the drawer's end stop
 BEHIND = 0.028  # metres behind the bar's centre, where the fingers descend: the middle of the gap
-PULL, PULL_SPEED = 0.2, 0.04  # metres, and metres per action: below the gripper's limit
+PULL, PULL_SPEED = 0.2, 0.16  # metres, and metres per second
 HEIGHT = 0.034
 
 
@@ -45,7 +45,8 @@ class DrawerOpening(Task):
         inward = np.array([np.cos(yaw), np.sin(yaw)])
         bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * inward
         start = bar + BEHIND * inward
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * inward, HEIGHT, PULL_SPEED)
+        step = scene.control.step_at(PULL_SPEED)
+        motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * inward, HEIGHT, step)
         return np.append(motion, CLOSED)
 
 

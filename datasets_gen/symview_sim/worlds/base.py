@@ -76,6 +76,8 @@ class MujocoSettings(WorldSettings):
         OptionError: as `WorldSettings`, or if a number of actions is out of range, or a camera is to see no robot.
     """
 
+    max_steps: int = 50
+    """Actions per episode."""
     action_repeat: int = 1
     """Steps of the simulator per action, in equal parts."""
 
@@ -99,6 +101,11 @@ class MujocoSettings(WorldSettings):
     def actions_per_second(self) -> int:
         """Actions per second."""
         return max(round(self.steps_per_second / self.action_repeat), 1)
+
+    @property
+    def episode_steps(self) -> int:
+        """Largest number of actions of an episode."""
+        return self.max_steps
 
     @property
     @abstractmethod

@@ -20,7 +20,7 @@ class MujocoEnv(TableEnv):
     Action: (4,) float32: dx, dy, dz, metres, in equal parts over the steps of `action_repeat`, and aperture in [0, 1].
     State: (4,) gripper x, y (metres, relative to the workspace centre), z (metres above the table), aperture.
     Reward: 1 when the task is solved, which ends the episode, else 0. `info["is_success"]` is the same as a bool.
-    End: success, or `max_steps` actions.
+    End: success, or `episode_steps` actions.
 
     Args:
         settings: task, workspace, cameras and limits.

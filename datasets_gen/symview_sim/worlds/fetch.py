@@ -41,8 +41,6 @@ class FetchSettings(MujocoSettings):
     """The first camera: pose, image size and depth sensor."""
     workspace: Workspace = field(default_factory=lambda: Workspace((0.95, 0.0), 0.4, 0.25))
     """The working area on the table; the robot stands at the origin and looks along x."""
-    max_steps: int = 50
-    """Actions per episode."""
 
     packages = ("gymnasium-robotics", "mujoco")
     steps_per_second = 25

@@ -8,6 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from lerobot_symview.registry import lookup
+from symview_sim.control import CONTROLS
 from symview_sim.settings import EnvSettings
 from symview_sim.tasks import TASK_NAMES, check_task
 
@@ -18,6 +20,8 @@ class ExpertsBenchmark:
 
     seeds: int = 200
     """Episodes per task; episode i has seed i."""
+    control: str = "coarse"
+    """Rate and size of the actions, `coarse` or `fine`."""
     tasks: list[str] = field(default_factory=lambda: list(TASK_NAMES))
     """Tasks to run."""
     json: bool = False
@@ -26,6 +30,7 @@ class ExpertsBenchmark:
     def __post_init__(self) -> None:
         if self.seeds < 1:
             raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
+        lookup("--control", self.control, CONTROLS)
         for task in self.tasks:
             check_task(task)
 
@@ -38,7 +43,7 @@ def benchmark_experts(config: ExpertsBenchmark) -> dict[str, dict[str, float]]:
     """
     results = {}
     for task in config.tasks:
-        env = EnvSettings(task=task).make()
+        env = EnvSettings(task=task, control=config.control).make()
         successes, lengths = 0, []
         for seed in tqdm(range(config.seeds), desc=task, unit="episode"):
             env.reset(seed=seed)

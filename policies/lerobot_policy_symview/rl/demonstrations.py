@@ -42,7 +42,7 @@ def open_dataset(target: DatasetLocation) -> Any:
 
 
 def check_scene(dataset: Any, env: EnvSettings, camera: str, merged: Sequence[str] = ()) -> None:
-    """Check that a dataset's workspace, task, robot and cameras are those to simulate.
+    """Check that a dataset's workspace, task, robot, control and cameras are those to simulate.
 
     A dataset without `meta/symview_recording.json`, such as a merged one, may have several tasks, robots and cameras;
     they are not checked.
@@ -67,7 +67,7 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str, merged: Sequence[st
     cameras = {spec["name"]: spec for spec in (recorded["camera"], *recorded["more_cameras"])} if recorded else {}
     pairs: dict[str, tuple[Any, Any]] = {}
     for flag, ours, theirs in (
-        ("--env", {"task": env.task, "robot": env.robot}, recorded),
+        ("--env", {"task": env.task, "robot": env.robot, "control": env.control}, recorded),
         ("--env.workspace", asdict(env.workspace), info.get("symview", {}).get("workspace", {})),
         ("--env.camera", asdict(simulated[camera]), cameras.get(camera, {})),
         *((f"--env.more_cameras: {name}", asdict(simulated[name]), cameras.get(name, {})) for name in merged),

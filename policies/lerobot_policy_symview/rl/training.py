@@ -188,7 +188,7 @@ class Training:
         config = self.config
         # the last frames of episodes that ran out of time take slots too
         share = math.ceil(min(config.replay.capacity / config.num_simulators, config.steps))
-        length = share + share // config.env.max_steps + 2
+        length = share + share // config.env.episode_steps + 2
         observation, action = next(observations(self._dataset))
         example = self.learner.codec.pack(self.actor.preprocessor(observation))[0]
         lengths = [len(self._dataset), *[length] * config.num_simulators]

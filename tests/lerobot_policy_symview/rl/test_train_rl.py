@@ -323,6 +323,7 @@ def test_errors_name_the_invalid_flag(recorded, tmp_path, options, message):
     ("env", "policy", "message"),
     [
         (EnvSettings(task="drawer_opening"), {}, "--env.task is 'drawer_opening', the dataset has 'block_picking'"),
+        (EnvSettings(control="fine"), {}, "--env.control is 'fine', the dataset has 'coarse'"),
         (EnvSettings(camera=CameraSpec(elevation_deg=30)), {}, "--env.camera.elevation_deg is 30, the dataset has 45"),
         (EnvSettings(), {"camera": "left"}, "--policy.camera=left is not simulated; --env.camera.name is 'side'"),
     ],

@@ -16,6 +16,11 @@ pytestmark = pytest.mark.long
 def test_the_experts_benchmark_reports_every_task():
     results = experts.benchmark_experts(experts.ExpertsBenchmark(seeds=2, tasks=["block_picking"]))
     assert results == {"block_picking": {"success": 1.0, "mean_length": 7.0, "min_length": 7, "max_length": 7}}
+    fine = experts.benchmark_experts(experts.ExpertsBenchmark(seeds=2, tasks=["block_picking"], control="fine"))
+    assert fine["block_picking"]["success"] == 1.0
+    assert fine["block_picking"]["min_length"] > 25
+    with pytest.raises(ValueError, match="unknown --control 'fines'"):
+        experts.ExpertsBenchmark(control="fines")
 
 
 def test_the_env_benchmark_names_every_time(monkeypatch, capsys):
