@@ -22,6 +22,10 @@ class CalibrationError(SymviewError, ValueError):
     """A camera's intrinsics or pose are invalid, or too little of the workspace is in its image."""
 
 
+class KinematicsError(SymviewError, ValueError):
+    """A robot's model or joints are invalid or contradict each other, or a pose is out of reach."""
+
+
 class DatasetError(SymviewError):
     """A dataset is missing or malformed, or lacks a required feature or file."""
 
