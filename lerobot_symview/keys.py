@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Mapping
 
 STATE = "observation.state"
 ACTION = "action"
+JOINTS, JOINT_TARGETS = "observation.joints", "observation.joint_targets"  # kept beside a converted state and action
 STATE_NAMES = ["x", "y", "z", "yaw", "aperture"]
 ACTION_NAMES = ["dx", "dy", "dz", "dyaw", "aperture"]
 IMAGES, CALIBRATIONS = "observation.images.", "observation.camera."

@@ -19,7 +19,6 @@ from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.calibration.readings import PoseReading, ReadingError
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_units
 from lerobot_symview.datasets.derivation import (
-    Derivation,
     cut_parts,
     derived_schema,
     finish,
@@ -39,6 +38,7 @@ from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import ADDED_VIEWS
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
+from lerobot_symview.datasets.view_derivation import ViewDerivation
 from lerobot_symview.geometry.gripper_state import REQUIRED
 from lerobot_symview.geometry.state_reader import StateOrigin, StateReader
 from lerobot_symview.geometry.units import parse_unit
@@ -165,8 +165,10 @@ def _write(config: AddViewsConfig) -> Path:
     with flagged("--dataset"):
         source = SourceDataset(config.dataset.folder())
     target = config.target().folder()
-    _check_apart(source.folder, target)
-    executor = EXECUTORS["local"](config.num_workers, "lerobot_symview.datasets.derivation")  # starts while this plans
+    check_apart(source.folder, target)
+    executor = EXECUTORS["local"](
+        config.num_workers, "lerobot_symview.datasets.view_derivation"
+    )  # starts while this plans
     derivation = _plan(config, source, partial_folder(target))
     description = _description(config, derivation)
     if is_complete(target, ADDED_VIEWS, description, config.resume, "--new_root"):
@@ -178,12 +180,12 @@ def _write(config: AddViewsConfig) -> Path:
         with executor, tqdm(desc=names, total=frames, unit="frame") as bar:
             for count in executor.run(partial(write_part, derivation), list(enumerate(parts))):
                 bar.update(count)
-        finish(derivation, parts, description)
+        finish(derivation, parts, description, ADDED_VIEWS)
     logger.info("wrote %d frames with %s to %s", frames, names, target)
     return target
 
 
-def _check_apart(source: Path, target: Path) -> None:
+def check_apart(source: Path, target: Path) -> None:
     """Raise a ValueError if the source and the result would lie within each other."""
     source = source.resolve()
     for written in (target.resolve(), partial_folder(target).resolve()):
@@ -194,7 +196,7 @@ def _check_apart(source: Path, target: Path) -> None:
             )
 
 
-def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Derivation:
+def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> ViewDerivation:
     calibration, workspace = calibration_and_workspace(
         config.calibration, config.workspace, source.features, config.camera, config.pose
     )
@@ -221,19 +223,19 @@ def _plan(config: AddViewsConfig, source: SourceDataset, folder: Path) -> Deriva
         reader = with_depth_units(reader, unit_from_flag(config.depth_unit))
     _check_names(config, source.features, added)
     source.check_files([key for key in source.features if key not in dropped or key in reader.features()])
-    return Derivation(
-        source.folder,
-        source_fingerprint(source),
-        folder,
-        config.camera,
-        views,
-        workspace,
-        calibration,
-        dict(reader.depth_units),
-        config.state_origin,
-        dropped,
-        added,
-        derived_schema(source, dropped, added),
+    return ViewDerivation(
+        source=source.folder,
+        source_files=source_fingerprint(source),
+        folder=folder,
+        camera=config.camera,
+        views=views,
+        workspace=workspace,
+        calibration=calibration,
+        depth_units=dict(reader.depth_units),
+        state_origin=config.state_origin,
+        dropped=dropped,
+        added=added,
+        schema=derived_schema(source, dropped, added),
     )
 
 
@@ -304,9 +306,9 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
         raise ValueError(f"--keep names {', '.join(unknown)}, which the dataset lacks; it has {', '.join(images)}")
 
 
-def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
+def _check_first_frame(derivation: ViewDerivation, source: SourceDataset) -> None:
     """Render the first frame, so that errors that concern every frame are raised before anything is written."""
-    reader = derivation.reader(source)
+    reader = derivation.reader
     with flagged(f"--camera={derivation.camera}, --calibration, --depth_unit"):
         check_calibration(reader)
     frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
@@ -314,7 +316,7 @@ def _check_first_frame(derivation: Derivation, source: SourceDataset) -> None:
         view.render(frame)
 
 
-def _description(config: AddViewsConfig, derivation: Derivation) -> dict[str, Any]:
+def _description(config: AddViewsConfig, derivation: ViewDerivation) -> dict[str, Any]:
     """Return all settings that determine the result, and those of earlier views that say how to read it."""
     earlier = derivation.open_source().added_views
     return plain(

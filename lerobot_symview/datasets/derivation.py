@@ -1,4 +1,4 @@
-"""Derived datasets: the episodes of a source with views added, written in parts by any number of processes.
+"""Derived datasets: the episodes of a source with new columns, written in parts by any number of processes.
 
     <target>.partial/request.json       settings of the result; a resumed run must have the same
     <target>.partial/dataset/           the result; each table file is one part, complete or absent
@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -23,24 +24,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from lerobot_symview import keys
-from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.features import Features, calibration_vectors
-from lerobot_symview.datasets.frame_reader import FrameReader
-from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
-from lerobot_symview.datasets.image_statistics import ImageStatistics, constant_summary, image_summary
-from lerobot_symview.datasets.metadata import ADDED_VIEWS
+from lerobot_symview.datasets.features import Features
+from lerobot_symview.datasets.image_statistics import ImageStatistics, image_summary
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
-from lerobot_symview.geometry.state_reader import StateOrigin
-from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of
-from lerobot_symview.views import View
 
 PART_FRAMES = 200  # least frames of a part, unless its source file has fewer
 
 
-@dataclass(frozen=True)
-class Derivation:
+@dataclass(frozen=True, kw_only=True)
+class Derivation(ABC):
     """Source, settings and schema of a derived dataset; small enough to send to every worker."""
 
     source: Path
@@ -49,24 +42,36 @@ class Derivation:
     """`source_fingerprint` of the source when the run started."""
     folder: Path
     """`<target>.partial`."""
-    camera: str
-    """Camera whose images the views are rendered from, and under whose name they are stored."""
-    views: dict[str, View]
-    """Views to add, by name."""
-    workspace: Workspace
-    """Square on the table that the views show."""
-    calibration: Calibration | None
-    """Calibration of the cameras that is not in the source; it is added to the result."""
-    depth_units: dict[str, float]
-    """Camera -> metres per unit of its depth; others as the source declares."""
-    state_origin: StateOrigin | None
-    """What the state's positions count from; None for the default of its names."""
     dropped: list[str]
     """Keys of the source features that are not copied."""
     added: Features
-    """Declarations of the new features."""
+    """Declarations of the new features; one of the source's name takes its place."""
+    declared: Features = field(default_factory=dict)
+    """Declarations of copied features that change."""
     schema: pa.Schema = field(repr=False)
     """Schema of the result's tables."""
+
+    @property
+    @abstractmethod
+    def columns(self) -> list[str]:
+        """Columns of the source from which the new ones are made."""
+
+    @abstractmethod
+    def derive(self, episode: int, table: pa.Table) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
+        """Return an episode's new columns, and the statistics of its new images."""
+
+    @property
+    def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
+        """`rgb` or `height` for every new image feature."""
+        return {}
+
+    @abstractmethod
+    def vector_summaries(self, episodes: list[pa.Table]) -> dict[str, list[dict[str, Any]]]:
+        """Return LeRobot's statistics of every other new feature: over the dataset, then over each episode.
+
+        Args:
+            episodes: the new vectors of every episode of the result.
+        """
 
     @property
     def dataset(self) -> Path:
@@ -77,22 +82,9 @@ class Derivation:
         """Return the source dataset; its metadata is cached per process."""
         return _opened(self.source, self.source_files)
 
-    def reader(self, source: SourceDataset) -> FrameReader:
-        """Return a reader of the frames that the views are rendered from."""
-        views, calibration = self.views.values(), self.calibration
-        return FrameReader(source, self.camera, self.workspace, views, calibration, self.depth_units, self.state_origin)
-
-    def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
-        """Return `rgb` or `height` for every new image feature."""
-        return {
-            keys.view(self.camera, output): kind
-            for view in self.views.values()
-            for output, kind in view.outputs.items()
-        }
-
     def no_statistics(self) -> dict[str, ImageStatistics]:
         """Return empty statistics for every new image feature."""
-        return {key: ImageStatistics.empty(kind) for key, kind in self.image_kinds().items()}
+        return {key: ImageStatistics.empty(kind) for key, kind in self.image_kinds.items()}
 
     def table_file(self, source: SourceDataset, part: int) -> Path:
         """Return the file of a part's table in the result."""
@@ -150,9 +142,8 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
         return count
     merged = derivation.no_statistics()
     summaries: dict[str, list[NDArray]] = {key: [] for key in merged}
-    reader = derivation.reader(source)
     kept = [name for name in derivation.schema.names if name not in derivation.added]
-    columns = list(dict.fromkeys([*kept, *reader.columns()]))
+    columns = list(dict.fromkeys([*kept, *derivation.columns]))
     tables = EpisodeTables(source, source.data_file(episodes.start), columns)
     # Temporary files are outside the result, so that it contains none if a process is killed.
     table_part, statistics_part = (part_of(derivation.folder / file.name) for file in (table_file, statistics_file))
@@ -161,7 +152,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
             with pq.ParquetWriter(table_part, derivation.schema) as writer:
                 for episode in episodes:
                     table = tables.read(episode)
-                    new, statistics = _render(derivation, reader, episode, table)
+                    new, statistics = derivation.derive(episode, table)
                     arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
                     # one row group per episode, as LeRobot writes them
                     writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))
@@ -179,42 +170,6 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     return count
 
 
-def _render(
-    derivation: Derivation, reader: FrameReader, episode: int, table: pa.Table
-) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
-    """Render an episode; return its new columns and the statistics of its new images."""
-    kinds, statistics = derivation.image_kinds(), derivation.no_statistics()
-    encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
-    renderers = [view.start_episode() for view in derivation.views.values()]
-    for frame in reader.frames(episode, table):
-        for render in renderers:
-            for output, image in render(frame).items():
-                key = keys.view(derivation.camera, output)
-                statistics[key].add(image)
-                encoded[key].append(encode_rgb(image) if kinds[key] == "rgb" else encode_metres(image))
-    columns: dict[str, pa.Array] = {}
-    for key, images in encoded.items():
-        columns[key] = image_column(images, "png" if kinds[key] == "rgb" else "tiff")
-    for key, values in _added_vectors(reader).items():
-        flat = pa.array(np.tile(values, len(table)))
-        columns[key] = pa.FixedSizeListArray.from_arrays(flat, len(values))
-    return columns, statistics
-
-
-def image_column(images: list[bytes], extension: str) -> pa.StructArray:
-    """Return encoded images as an image column of Hugging Face's `datasets`, with LeRobot's file names."""
-    names = [f"frame-{index:06d}.{extension}" for index in range(len(images))]
-    return pa.StructArray.from_arrays([pa.array(images, pa.binary()), pa.array(names)], ["bytes", "path"])
-
-
-def _added_vectors(reader: FrameReader) -> dict[str, np.ndarray]:
-    """Return the calibration that is added to the result, flattened float32, by feature key."""
-    vectors: dict[str, np.ndarray] = {}
-    for name, camera in reader.given_cameras().items():
-        vectors |= calibration_vectors(name, camera)
-    return vectors
-
-
 def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArray]]) -> dict[str, Any]:
     packed: dict[str, Any] = {}
     for key, total in merged.items():
@@ -223,8 +178,8 @@ def _packed(merged: dict[str, ImageStatistics], summaries: dict[str, list[NDArra
     return packed
 
 
-def finish(derivation: Derivation, parts: list[range], description: dict[str, Any]) -> None:
-    """Add videos and metadata to the result once all its tables are written."""
+def finish(derivation: Derivation, parts: list[range], description: dict[str, Any], settings: str) -> None:
+    """Add videos and metadata to the result once all its tables are written; `description` to the file `settings`."""
     source = derivation.open_source()
     with disk_errors(derivation.folder):
         for key, feature in source.features.items():
@@ -239,14 +194,14 @@ def finish(derivation: Derivation, parts: list[range], description: dict[str, An
             _rewrite_episodes(file, derivation, source, parts, of_episodes)
         info = dict(source.info)
         kept = {key: feature for key, feature in source.features.items() if key not in derivation.dropped}
-        info["features"] = kept | derivation.added
+        info["features"] = kept | derivation.declared | derivation.added
         if not any(feature["dtype"] == "video" for feature in kept.values()):
             info["video_path"] = None
         (meta / "info.json").write_text(json.dumps(info, indent=4))
         stats = json.loads((meta / "stats.json").read_text())
         stats = {key: value for key, value in stats.items() if key not in derivation.dropped} | totals
         (meta / "stats.json").write_text(json.dumps(stats, indent=4, sort_keys=True))
-        (meta / ADDED_VIEWS).write_text(json.dumps(description, indent=4))
+        (meta / settings).write_text(json.dumps(description, indent=4))
 
 
 def _collect_statistics(
@@ -262,13 +217,26 @@ def _collect_statistics(
                 total.merge(ImageStatistics(total.kind, int(images), counts, sums))
                 summaries[key].append(content[f"{key}/summaries"])
     lengths = [row["length"] for row in source.episodes]
-    collected = {key: image_summary(total.summary(), total.images) for key, total in totals.items()}
+    collected: dict[str, Any] = {key: image_summary(total.summary(), total.images) for key, total in totals.items()}
     of_episodes = {key: image_summary(np.concatenate(values), lengths) for key, values in summaries.items()}
-    for key, values in _added_vectors(derivation.reader(source)).items():
-        collected[key] = constant_summary(values, sum(lengths))
-        each = [constant_summary(values, length) for length in lengths]
-        of_episodes[key] = {name: [summary[name] for summary in each] for name in each[0]}
+    for key, (whole, *each) in derivation.vector_summaries(_new_vectors(derivation, source, parts)).items():
+        collected[key] = whole
+        of_episodes[key] = {name: [summary[name] for summary in each] for name in whole}
     return collected, of_episodes
+
+
+def _new_vectors(derivation: Derivation, source: SourceDataset, parts: list[range]) -> list[pa.Table]:
+    """Return the new columns of every episode of the result, without images."""
+    names = [name for name in derivation.added if name not in derivation.image_kinds]
+    tables = []
+    for part, episodes in enumerate(parts):
+        table = pq.read_table(derivation.table_file(source, part), columns=names)
+        first = 0
+        for episode in episodes:
+            length = source.episodes[episode]["length"]
+            tables.append(table.slice(first, length))
+            first += length
+    return tables
 
 
 def _rewrite_episodes(

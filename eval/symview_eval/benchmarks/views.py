@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_symview import keys
-from lerobot_symview.datasets import derivation
+from lerobot_symview.datasets import view_derivation
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_rgb, encode_rgb
@@ -51,9 +51,9 @@ VIEWS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 CODECS = (
     (SourceDataset, "decode"),
-    (derivation, "encode_rgb"),
-    (derivation, "encode_metres"),
-    (derivation, "image_column"),
+    (view_derivation, "encode_rgb"),
+    (view_derivation, "encode_metres"),
+    (view_derivation, "image_column"),
     (pq.ParquetFile, "read_row_groups"),
     (pq.ParquetWriter, "write_table"),
 )

@@ -30,6 +30,7 @@ from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 
 TYPES = ("x", "y", "rx", "ry", "z", "yaw", "sign", "aperture", "scalar")
 PAIRS = {"x": "y", "rx": "ry"}
+NAMED = {"tilt": "scalar"}  # of dimensions whose name says their type
 REPEATED = ("sign", "scalar")  # types that may occur several times without a name
 SMALLEST_EXTENT = 1e-6
 MAX_DIMENSIONS = 256
@@ -191,7 +192,8 @@ def types_of(names: Sequence[str]) -> list[str] | None:
 
 def _type_of(name: str) -> str | None:
     """Return the type that a dimension's name is, or is an increment of; None if it is neither."""
-    return next((kind for kind in (name, name.removeprefix("d")) if kind in TYPES), None)
+    kinds = (NAMED.get(kind, kind) for kind in (name, name.removeprefix("d")))
+    return next((kind for kind in kinds if kind in TYPES), None)
 
 
 def _can_be(name: str, kind: str) -> bool:
