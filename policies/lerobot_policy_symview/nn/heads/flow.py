@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 BLOCKS = 3
-OCTAVES = 6  # frequencies of the time's embedding
+OCTAVES, HIDDEN = 6, 64  # frequencies and hidden numbers of the time's embedding
 NOISE_SAMPLES = 4  # noisy chunks per observation and step: the denoiser costs little beside the encoder
 
 
@@ -33,7 +33,7 @@ class Denoiser(nn.Module):
         self.width = width
         self.enter = nn.Linear(size, width)
         self.condition = nn.Linear(fields, BLOCKS * width)
-        self.time = nn.Sequential(nn.Linear(2 * OCTAVES, width), nn.SiLU(), nn.Linear(width, BLOCKS * width))
+        self.time = nn.Sequential(nn.Linear(2 * OCTAVES, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, BLOCKS * width))
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(BLOCKS))
         self.widen = nn.ModuleList(nn.Linear(width, width, bias=False) for _ in range(BLOCKS))
         self.narrow = nn.ModuleList(nn.Linear(width, width) for _ in range(BLOCKS))
@@ -97,7 +97,8 @@ class FlowHead(nn.Module):
         noise = torch.randn_like(target) if self.has_noise else torch.zeros_like(target)
         shape = (*target.shape[:2], 1, 1)
         time = torch.rand(shape, device=chunk.device, dtype=chunk.dtype) if self.has_noise else target.new_zeros(shape)
-        velocity = self._velocity(torch.lerp(noise, target, time), self._condition(features), time[..., 0, 0])
+        times = self.denoiser.time_condition(time[..., 0])
+        velocity = self._velocity(torch.lerp(noise, target, time), self._condition(features), times)
         errors = (velocity - (target - noise)).square().mean(dim=(0, 3))
         if is_pad is None:
             return errors.mean(dim=1)
@@ -113,9 +114,10 @@ class FlowHead(nn.Module):
             steps: of the integration.
         """
         condition = self._condition(features)
+        times = self.denoiser.time_condition(torch.arange(steps, device=noise.device, dtype=noise.dtype) / steps)
         chunk = noise
-        for step in range(steps):
-            chunk = chunk + self._velocity(chunk, condition, chunk.new_full((len(chunk),), step / steps)) / steps
+        for time in times:
+            chunk = chunk + self._velocity(chunk, condition, time) / steps
         return chunk
 
     def _condition(self, features: Tensor) -> Tensor:
@@ -123,16 +125,16 @@ class FlowHead(nn.Module):
         return condition
 
     def _velocity(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
-        """Return velocities (..., B, H, A) of noisy chunks (..., B, H, A) at times (..., B).
+        """Return velocities (..., B, H, A) of noisy chunks (..., B, H, A).
 
         Args:
             chunk: noisy chunks.
             condition: (B, G, C), of the features.
-            time: in [0, 1].
+            time: (..., B, 1, C) or (C,), of the times.
         """
         with torch.autocast(chunk.device.type, enabled=False):  # rho(g)^-1 is its transpose
             lifted = torch.einsum("gba,...hb->...gha", self.representation, chunk)
-        velocity = self.denoiser(lifted.flatten(-2), condition, self.denoiser.time_condition(time)[..., None, :])
+        velocity = self.denoiser(lifted.flatten(-2), condition, time)
         with torch.autocast(chunk.device.type, enabled=False):
             velocity = velocity.to(chunk.dtype).unflatten(-1, chunk.shape[-2:])
             return torch.einsum("gab,...ghb->...ha", self.representation, velocity) / len(self.representation)
