@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_symview.configuration_chunks import ChunkConfig
-from lerobot_policy_symview.inputs.history import as_frames, history_length, stacked, with_length
+from lerobot_policy_symview.inputs.history import as_frames, history_length, latest, stacked, with_length
+from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.policy import MakeHead, Network, Stats, SymviewPolicy, scale_of
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_policy_symview.tracing import is_exporting
@@ -80,7 +81,12 @@ class ChunkPolicy(SymviewPolicy):
     def forward(
         self, batch: dict[str, Tensor], reduction: Literal["mean", "none"] = "mean"
     ) -> tuple[Tensor, dict[str, Any]]:
-        """Return the loss, mean or (B,), and no metrics: reading a number makes every step wait for a GPU."""
+        """Return the loss, mean or (B,), and metrics for the log.
+
+        Only relaxed networks have a metric: reading a number from a GPU makes every step wait for it.
+        """
+        if self.training and self.config.aperture_noise:
+            batch = batch | {keys.STATE: self._noisy(batch[keys.STATE])}
         state, actions, is_pad = self._present_state(batch), batch[keys.ACTION], batch.get(f"{keys.ACTION}_is_pad")
         actions = actions if actions.ndim == 3 else actions[:, None]
         transform, crop_offset = None, None
@@ -92,7 +98,12 @@ class ChunkPolicy(SymviewPolicy):
             state = self.config.states.transform(state, transform, absolute_yaw=True)
         chunk = self.scaled(self.config.trajectories.relative(actions, state, is_pad))
         errors = self.errors(self._features(self.network, batch, transform, crop_offset), chunk, is_pad)
-        return (errors if reduction == "none" else errors.mean()), {}
+        output = {}
+        if self.config.encoder == "relaxed":
+            penalty = asymmetry(self.network)
+            output["asymmetry"] = penalty.item()
+            errors = errors + self.config.relaxation_weight * penalty
+        return (errors if reduction == "none" else errors.mean()), output
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **kwargs: Any) -> Tensor:
@@ -109,7 +120,7 @@ class ChunkPolicy(SymviewPolicy):
         """
         self.eval()
         state = self._present_state(batch)
-        self.check_first_image(batch)
+        self.check_first_image(latest(batch))
         noise = self.draw_noise(state.shape[0]) if noise is None else noise
         network = self.averaged or self.network
         with self.precision():
@@ -136,6 +147,13 @@ class ChunkPolicy(SymviewPolicy):
             chunk = self.predict_action_chunk(stacked(self._observations), noise=noise)
             self._planned.extend(chunk[:, : self.config.n_action_steps].unbind(1))
         return self._planned.popleft()
+
+    def _noisy(self, state: Tensor) -> Tensor:
+        """Return states (..., S) with noise on the apertures."""
+        apertures = self.config.states.of_type("aperture")
+        noisy = state.clone()
+        noisy[..., apertures] += self.config.aperture_noise * torch.randn_like(noisy[..., apertures])
+        return noisy
 
     def _features(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,6 +30,11 @@ class ChunkConfig(SymviewConfig):
     denoiser_width: int = 256
     """Hidden numbers per group element of the network that predicts chunks."""
 
+    aperture_noise: float = 0.0
+    """Standard deviation of Gaussian noise on the state's `aperture` dimensions in training, in their unit. An expert
+    opens the gripper to exactly the same aperture every time, a policy does not: without noise, the policy's own
+    apertures are out of distribution."""
+
     def check(self) -> None:
         """Check the fields of all policies and those of chunks."""
         super().check()
@@ -43,6 +49,13 @@ class ChunkConfig(SymviewConfig):
             )
         if self.drop_n_last_frames < 0:
             raise ValueError(f"--policy.drop_n_last_frames must not be negative, got {self.drop_n_last_frames}")
+        if not 0 <= self.aperture_noise < math.inf:
+            raise ValueError(f"--policy.aperture_noise must be finite and at least 0, got {self.aperture_noise}")
+        if self.aperture_noise and not self.states.of_type("aperture"):
+            raise ValueError(
+                f"--policy.aperture_noise={self.aperture_noise} needs a dimension `aperture` in "
+                f"--policy.state_symmetry, got {self.state_symmetry}"
+            )
         _ = self.trajectories
 
     @property

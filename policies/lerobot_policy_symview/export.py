@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lerobot_policy_symview.chunks import ChunkPolicy
 from lerobot_policy_symview.policy import SymviewPolicy
 
 
@@ -44,7 +45,15 @@ def export_policy(policy: SymviewPolicy, observation: dict[str, Tensor]) -> torc
 
     Returns:
         The program of a `PolicyModule`; `example_inputs` has the features that it reads.
+
+    Raises:
+        ValueError: if the policy has a memory: its observations and planned actions are no part of a program.
     """
+    if isinstance(policy, ChunkPolicy) and not policy.config.is_reactive:
+        raise ValueError(
+            f"only policies of one observation and one action can be exported; this {policy.name} has n_obs_steps="
+            f"{policy.config.n_obs_steps} and horizon={policy.config.horizon}"
+        )
     # two samples, since torch.export takes a size of 1 for a constant
     read = [*policy.scene.keys, *policy.scene.optional_keys]
     example = {key: torch.cat([observation[key][:1]] * 2) for key in read if key in observation}

@@ -17,7 +17,7 @@ OBSERVATIONS = {
     "persp": "a top-down view of the table, warped by a homography from the RGB image of the camera `{camera}`",
 }
 LIMITS = """\
-- It acts on a single observation of one camera. The camera must be calibrated: the calibration is read from the
+- It acts on {observations}. The camera must be calibrated: the calibration is read from the
   observation or given in the configuration.
 - Reach, occlusion by the arm and lighting break the symmetry: they do not rotate with the scene.
 - Actions are limited to the range of the training data; nothing outside the training conditions has been tested."""
@@ -69,7 +69,7 @@ def model_card(
         _evaluation(evaluation),
         "## Usage\n",
         f"```bash\nlerobot-eval --policy.path={repository} --env.type=symview --eval.n_episodes=50\n```\n",
-        f"## Limits\n\n{LIMITS}\n",
+        f"## Limits\n\n{LIMITS.format(observations=_observations(config))}\n",
     ]
     return ModelCard("\n".join(sections))
 
@@ -79,6 +79,13 @@ def _evaluation(evaluation: Sequence[dict[str, float]]) -> str:
         return "Not evaluated during training; the command below evaluates it.\n"
     rows = [f"| {row['step']:,.0f} | {100 * row['success']:.0f} % | {row['return']:.2f} |" for row in evaluation]
     return "\n".join(["| step | success | discounted return |", "|---|---|---|", *rows, ""])
+
+
+def _observations(config: SymviewConfig) -> str:
+    """Return how many observations the policy sees, and how many actions it takes from them."""
+    count, horizon = config.n_obs_steps, getattr(config, "horizon", 1)
+    seen = ("a single observation" if count == 1 else f"the last {count} observations") + " of one camera"
+    return seen if horizon == 1 else f"{seen} and predicts {horizon} actions"
 
 
 def _symmetry(config: SymviewConfig) -> str:

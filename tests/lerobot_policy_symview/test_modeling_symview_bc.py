@@ -108,7 +108,7 @@ def test_an_action_that_is_not_finite_is_reported_with_its_cause(spoilt, message
         next((policy.averaged or policy.network).parameters()).data.fill_(torch.nan)
     if spoilt == "overflow":
         policy.action_width[2] = policy.action_center[2] = 3e38
-        policy.best_action = lambda network, observation, state: torch.ones(1, 5)
+        policy.scaled_chunk = lambda network, features, noise: torch.ones(1, 1, 5)
     for act in (policy.select_action, policy.predict_action_chunk):
         with pytest.raises(DivergenceError, match=message):
             act(batch)
@@ -183,9 +183,11 @@ def test_losses_are_available_per_sample():
 
 def test_training_noise_changes_only_the_aperture(monkeypatch):
     states = []
-    original = SymviewBcPolicy.training_input
+    original = SymviewBcPolicy.network_input
     monkeypatch.setattr(
-        SymviewBcPolicy, "training_input", lambda self, batch: states.append(batch[keys.STATE]) or original(self, batch)
+        SymviewBcPolicy,
+        "network_input",
+        lambda self, batch, *others: states.append(batch[keys.STATE]) or original(self, batch, *others),
     )
     policy = make_policy(aperture_noise=0.03)
     batch = training_batch(policy.config, batch=200)

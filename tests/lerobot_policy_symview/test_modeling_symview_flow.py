@@ -10,7 +10,9 @@ from lerobot.scripts.lerobot_eval import rollout
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
 from lerobot_policy_symview.equivariance import assert_equivariant, equivariance_errors, example_observation
-from lerobot_policy_symview.inputs.history import as_history, stacked
+from lerobot_policy_symview.export import export_policy
+from lerobot_policy_symview.inputs.history import as_history, latest, stacked
+from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.modeling_symview_flow import SymviewFlowPolicy
 from lerobot_policy_symview.nn.heads import FlowHead
@@ -184,6 +186,38 @@ def test_more_integration_steps_approach_the_exact_flow():
         policy.config.integration_steps = steps
         chunks[steps] = policy.predict_action_chunk(observation, noise=noise)
     assert (chunks[8] - chunks[64]).abs().max() < (chunks[1] - chunks[64]).abs().max()
+
+
+def test_the_model_card_says_what_it_sees_and_predicts():
+    card = str(model_card(make_chunk_policy().config, 1000, "me/data", {}))
+    assert "It acts on the last 2 observations of one camera and predicts 6 actions." in card
+
+
+def test_a_policy_with_a_memory_is_not_exported():
+    policy = make_chunk_policy()
+    with pytest.raises(ValueError, match=r"only policies of one observation.*symview_flow has n_obs_steps=2 and horiz"):
+        export_policy(policy, example_observation(policy.config))
+
+
+def test_a_history_has_the_features_of_all_its_frames():
+    frame = example_observation(make_chunk_policy().config)
+    history = stacked([{keys.STATE: frame[keys.STATE]}, frame])
+    assert set(history) == {keys.STATE}
+    torch.testing.assert_close(latest(history)[keys.STATE], frame[keys.STATE])
+    torch.testing.assert_close(latest(frame)[keys.STATE], frame[keys.STATE])
+
+
+def test_a_policy_that_checks_the_camera_compares_the_present_image(monkeypatch):
+    policy = make_chunk_policy()
+    policy.config.check_camera = True
+    policy.register_buffer("reference_image", torch.zeros(3, 8, 8))
+    seen = []
+    monkeypatch.setattr("lerobot_policy_symview.policy.check_observation", lambda *arguments: seen.append(arguments[2]))
+    frames = [example_observation(policy.config) for _ in range(2)]
+    for frame in frames:
+        policy.select_action(frame)
+    assert len(seen) == 1
+    torch.testing.assert_close(seen[0][policy.config.color_key], frames[0][policy.config.color_key])
 
 
 def test_sampling_in_bfloat16_is_near_that_in_float32():

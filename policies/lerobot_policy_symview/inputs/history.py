@@ -38,13 +38,22 @@ def as_history(frames: Mapping[str, Any], length: int) -> dict[str, Any]:
 
 
 def stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return successive observations (B, ...) as one batch (B, T, ...)."""
-    latest = observations[-1]
+    """Return successive observations (B, ...) as one batch (B, T, ...) with the features that all of them have."""
     return {
         name: torch.stack([observation[name] for observation in observations], dim=1)
-        for name, values in latest.items()
-        if name.startswith(OBSERVATION) and isinstance(values, Tensor) and values.ndim
+        for name, values in observations[-1].items()
+        if name.startswith(OBSERVATION)
+        and isinstance(values, Tensor)
+        and values.ndim
+        and all(name in observation for observation in observations)
     }
+
+
+def latest(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the present observations (B, ...) of a batch, with a history or without."""
+    if history_length(batch) is None:
+        return dict(batch)
+    return {name: values[:, -1] if _has_time(name, values) else values for name, values in batch.items()}
 
 
 def with_length(batch: Mapping[str, Any], length: int) -> dict[str, Any]:
