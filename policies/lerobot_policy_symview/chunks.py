@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -36,8 +37,28 @@ class ChunkPolicy(SymviewPolicy):
 
     def __init__(self, config: ChunkConfig, make_head: MakeHead, dataset_stats: dict[str, dict[str, Any]] | None):
         super().__init__(config, lambda fields, *others: make_head(config.n_obs_steps * fields, *others), dataset_stats)
+        if config.action_mode == "absolute" and config.state_reader.converts:  # known once the calibration is read
+            raise ValueError(
+                "--policy.action_mode=absolute needs actions and states in one frame; these states count from the "
+                f"{config.state_origin or 'base'}: record positions relative to the workspace's centre, or increments"
+            )
         self._observations: deque[dict[str, Tensor]] = deque(maxlen=config.n_obs_steps)
         self._planned: deque[Tensor] = deque()
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """Load weights, as every policy does.
+
+        Raises:
+            ValueError: if they are those of a policy with other sizes of chunks.
+        """
+        for name in ("action_center", "network.head.denoiser.condition.weight"):
+            saved, own = state_dict.get(name), self.state_dict().get(name)
+            if saved is not None and own is not None and saved.shape != own.shape:
+                raise ValueError(
+                    f"the checkpoint has {name} of shape {tuple(saved.shape)}, this policy {tuple(own.shape)}: keep "
+                    "--policy.horizon, --policy.n_obs_steps, --policy.width and --policy.denoiser_width as trained"
+                )
+        return super().load_state_dict(state_dict, strict, assign)
 
     def action_scale(self, action: Stats | None, state: Stats | None) -> tuple[Tensor, Tensor]:
         """Return centre and half-width, (A,) or (H, A), of the trajectories."""

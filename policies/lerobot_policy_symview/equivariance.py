@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.inputs.history import as_history
+from lerobot_policy_symview.inputs.history import as_frames, as_history, history_length
 from lerobot_policy_symview.nn.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
@@ -86,8 +86,12 @@ def equivariance_errors(
     """
     config = policy.config
     preprocess, postprocess = processors or make_processors(config)
-    history = policy.history_length if observation is None else 1
-    raw = observation or example_observation(config, policy.action_center.dtype, batch=EXAMPLES * history)
+    if observation is None:
+        history = policy.history_length
+        raw = example_observation(config, policy.action_center.dtype, batch=EXAMPLES * history)
+    else:
+        history = history_length(observation) or 1
+        raw = as_frames(observation) if history_length(observation) else observation
     group = checked_group(config)
     training = policy.training
     noise = policy.draw_noise(len(raw[keys.STATE]) // history, torch.Generator().manual_seed(0))

@@ -17,12 +17,14 @@ from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.modeling_symview_flow import SymviewFlowPolicy
 from lerobot_policy_symview.nn.heads import FlowHead
 from lerobot_policy_symview.processor_pipelines import make_processors
+from lerobot_policy_symview.rl.rollouts import Actor
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
 from lerobot_symview import keys
 from tests.helpers.policies import STATS, make_config
 from tests.helpers.training import train as lerobot_train
 
+POSE = ["x", "y", "z", "yaw", "aperture"]
 HORIZON, CHUNK = 6, {"n_obs_steps": 2, "horizon": 6, "n_action_steps": 3, "denoiser_width": 64}
 POLICIES = {"flow": (SymviewFlowPolicy, SymviewFlowConfig), "regression": (SymviewBcPolicy, SymviewBcConfig)}
 
@@ -193,8 +195,27 @@ def test_the_model_card_says_what_it_sees_and_predicts():
     assert "It acts on the last 2 observations of one camera and predicts 6 actions." in card
 
 
+def test_absolute_actions_need_states_in_the_same_frame():
+    with pytest.raises(ValueError, match="needs actions and states in one frame; these states count from the world"):
+        make_chunk_policy(action_mode="absolute", state_origin="world", state_names=POSE)
+
+
+@pytest.mark.parametrize("other", [{"horizon": 5}, {"n_obs_steps": 1}, {"denoiser_width": 32}])
+def test_a_checkpoint_of_other_sizes_is_refused_by_the_flag(other, tmp_path):
+    make_chunk_policy().save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match=r"keep --policy.horizon, --policy.n_obs_steps, .*denoiser_width as trained"):
+        SymviewFlowPolicy.from_pretrained(tmp_path, config=make_chunk_policy(**other).config)
+
+
+def test_observations_of_a_dataset_with_a_history_show_equivariance():
+    policy = make_chunk_policy()
+    assert_equivariant(policy, observation=as_history(example_observation(policy.config, batch=6), 2))
+
+
 def test_a_policy_with_a_memory_is_not_exported():
     policy = make_chunk_policy()
+    with pytest.raises(ValueError, match=r"--policy.horizon=6 remembers observations and actions: use lerobot-eval"):
+        Actor(policy)
     with pytest.raises(ValueError, match=r"only policies of one observation.*symview_flow has n_obs_steps=2 and horiz"):
         export_policy(policy, example_observation(policy.config))
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_policy_symview.chunks import ChunkPolicy
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.policy import SymviewPolicy
@@ -33,10 +34,18 @@ class Actor:
     """A policy with its processors, which acts on the observations of simulators.
 
     Args:
-        policy: the policy.
+        policy: the policy; its episodes start and end at different times, so it must not have a memory.
+
+    Raises:
+        ValueError: if the policy has a memory.
     """
 
     def __init__(self, policy: SymviewPolicy):
+        if isinstance(policy, ChunkPolicy) and not policy.config.is_reactive:
+            raise ValueError(
+                f"{policy.name} with --policy.n_obs_steps={policy.config.n_obs_steps} and "
+                f"--policy.horizon={policy.config.horizon} remembers observations and actions: use lerobot-eval"
+            )
         self.policy = policy
         self.preprocessor, self.postprocessor = make_processors(policy.config, depth_units=metric_depth(policy.config))
 

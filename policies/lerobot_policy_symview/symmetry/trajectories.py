@@ -98,8 +98,9 @@ class Trajectories:
     def scale(self, action: Mapping[str, Any], state: Mapping[str, Any] | None, horizon: int) -> tuple[Tensor, Tensor]:
         """Return centre and half-width of the trajectories, by which scaling is equivariant.
 
-        A single action is scaled by its range. In a longer chunk, the displacement after k increments is at most k
-        times the largest one, and at most the range of the states.
+        A single increment is scaled by its range. In a longer chunk, the displacement after k increments is at most k
+        times the largest one, and at most the range of the states, if increments have the state's unit. That of a
+        target is at most its distance from any state. A dimension without extent gets width 1.
 
         Args:
             action: `min` and `max` (A,) of the actions in the dataset.
@@ -109,33 +110,44 @@ class Trajectories:
         Returns:
             (A,) each if H is 1, else (H, A) each.
         """
-        ends = [torch.as_tensor(action[end], dtype=torch.float32) for end in ("min", "max")]
-        center, width = self.actions.scale(*ends)
+        low, high = (torch.as_tensor(action[end], dtype=torch.float32) for end in ("min", "max"))
+        center, width = self.actions.scale(low, high)
         if horizon == 1 and self.mode == "delta":
             return center, width
-        extent = torch.maximum(ends[0].abs(), ends[1].abs())
-        reach = self._ranges(state, ends)
-        for pair in self.actions.pairs:
-            extent[list(pair)], reach[list(pair)] = extent[list(pair)].max(), reach[list(pair)].max()
-        steps = torch.arange(1, horizon + 1)[:, None]
-        largest = torch.full_like(extent, math.inf) if self.mode == "absolute" else extent
-        moving = torch.minimum(steps * largest, reach)
+        first, last = self._state_range(state, low, high)
+        if self.mode == "absolute":
+            reach = self._shared(torch.maximum((high - first).abs(), (last - low).abs()))
+            yaws = self.actions.of_type("yaw")
+            reach[yaws] = reach[yaws].clamp(max=math.pi)
+            moving = reach.expand(horizon, -1)
+        else:
+            largest = self._shared(torch.maximum(low.abs(), high.abs()))
+            reach = self._shared(last - first)
+            reach = torch.where(reach < largest, math.inf, reach)  # another unit, or unknown
+            moving = torch.minimum(torch.arange(1, horizon + 1)[:, None] * largest, reach)
+        moving = torch.where(moving > SMALLEST_EXTENT, moving, 1.0)
         center, width = center.repeat(horizon, 1), width.repeat(horizon, 1)
-        center[:, self.moving] = 0.0
-        width[:, self.moving] = moving[:, self.moving].clamp(min=SMALLEST_EXTENT)
+        center[:, self.moving], width[:, self.moving] = 0.0, moving[:, self.moving]
         return (center[0], width[0]) if horizon == 1 else (center, width)
 
-    def _ranges(self, state: Mapping[str, Any] | None, action_ends: list[Tensor]) -> Tensor:
-        """Return the largest displacement (A,) that the ranges allow; infinite where they say nothing."""
-        ranges = torch.full_like(action_ends[0], math.inf)
+    def _state_range(self, state: Mapping[str, Any] | None, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the ends (A,) of the state's range in the moving dimensions; where it is unknown, those given."""
+        first, last = low.clone(), high.clone()
+        if self.mode == "delta":
+            first, last = torch.zeros_like(low), torch.zeros_like(high)
         for index in self.moving:
             label = self.actions.dimensions[index]
-            if self.mode == "absolute":
-                ranges[index] = action_ends[1][index] - action_ends[0][index]
-            elif state is not None and label in self.states.dimensions:
+            if state is not None and label in self.states.dimensions:
                 column = self.states.dimensions.index(label)
-                ranges[index] = torch.as_tensor(state["max"])[column] - torch.as_tensor(state["min"])[column]
-        return torch.where(ranges > SMALLEST_EXTENT, ranges, torch.full_like(ranges, math.inf))
+                first[index], last[index] = (float(state[end][column]) for end in ("min", "max"))
+        return first, last
+
+    def _shared(self, extents: Tensor) -> Tensor:
+        """Return extents (A,) of which the two dimensions of a vector have the larger one."""
+        shared = extents.clone()
+        for pair in self.actions.pairs:
+            shared[list(pair)] = extents[list(pair)].max()
+        return shared
 
     def _start(self, state: Tensor) -> Tensor:
         """Return the gripper's pose in the moving dimensions."""

@@ -73,6 +73,34 @@ def test_scales_grow_with_time_up_to_the_range_of_the_states():
     torch.testing.assert_close(center[3], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
 
 
+def test_increments_in_another_unit_are_not_limited_by_the_state():
+    """Meta-World's commands lie in [-1, 1] and are centimetres, its state is in metres."""
+    ends = {"min": -torch.ones(5), "max": torch.ones(5)}
+    state = {"min": torch.zeros(5), "max": torch.full((5,), 0.3)}
+    _, width = Trajectories(POSE, POSE).scale(ends, state, horizon=16)
+    torch.testing.assert_close(width[-1], torch.tensor([16.0, 16.0, 16.0, 16.0, 1.0]))
+
+
+@pytest.mark.parametrize("horizon", [1, 4])
+@pytest.mark.parametrize("mode", MODES)
+def test_dimensions_that_never_move_have_width_one(mode, horizon):
+    ends = {"min": torch.tensor([-0.1, 0.0, 0.1, 0.0, 0.0]), "max": torch.tensor([0.1, 0.0, 0.1, 0.0, 1.0])}
+    state = {"min": torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0]), "max": torch.tensor([0.0, 0.0, 0.1, 0.0, 1.0])}
+    _, width = Trajectories(POSE, POSE, mode).scale(ends, state, horizon)
+    assert width.isfinite().all()
+    assert (width.reshape(-1, 5)[:, 3] == 1).all()
+    if mode == "absolute":
+        assert (width.reshape(-1, 5)[:, 2] == 1).all()
+
+
+def test_a_target_is_scaled_by_its_distance_from_the_states():
+    """Targets that span 5 cm, from starts 25 cm away."""
+    action = {"min": torch.tensor([0.2, 0, 0, -3.0, 0.0]), "max": torch.tensor([0.25, 0, 0, 3.0, 1.0])}
+    state = {"min": torch.tensor([-0.05, 0, 0, -3.0, 0.0]), "max": torch.tensor([0.2, 0, 0, 3.0, 1.0])}
+    _, width = Trajectories(POSE, POSE, "absolute").scale(action, state, horizon=2)
+    torch.testing.assert_close(width[1], torch.tensor([0.3, 0.3, 1.0, math.pi, 0.5]))
+
+
 def test_a_single_action_is_scaled_by_its_range():
     ends = {"min": -torch.ones(5), "max": torch.tensor([1.0, 2.0, 3.0, 1.0, 1.0])}
     for found, expected in zip(
