@@ -140,10 +140,7 @@ def test_imports_follow_the_allowed_direction(subpackage):
 
 @pytest.mark.parametrize("subpackage", ["geometry", "views", "calibration", "kinematics", "datasets"])
 def test_library_errors_name_no_flags(subpackage):
-    """Commands add the flag to an error.
-
-    `add_views`, `convert_actions` and `hub` are commands, `robot_flags` is of one, and a dataset card shows commands.
-    """
+    """Commands add the flag to an error. The modules excepted here are commands, or flags of one, or show commands."""
     commands = {"add_views.py", "convert_actions.py", "robot_flags.py", "hub.py", "card.py"}
     for path in files_of(f"lerobot_symview.{subpackage}"):
         tree = ast.parse(path.read_text())

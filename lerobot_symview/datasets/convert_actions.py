@@ -210,7 +210,7 @@ def _check_joints(arm: Arm, source: SourceDataset, config: ConvertActionsConfig)
     singular = float(is_singular(frames, arm.model.pivot).mean())
     if singular:
         logger.warning(
-            "in %.1f %% of the frames the fingers open up and down, or the gripper is over the first joint: "
+            "in %.1f %% of the frames the fingers point up, or the gripper is over the first joint: "
             "yaw and tilt are undefined there",
             100 * singular,
         )

@@ -1,8 +1,8 @@
 """The tool's pose as numbers that a table task is about: place, yaw, and how far the gripper leans off the vertical.
 
     x, y, z   metres, in the base's frame
-    yaw       angle about the vertical of the direction in which the fingers open, radians; modulo pi, because a
-              parallel gripper is symmetric
+    yaw       angle about the vertical of the direction in which the fingers open once they are swung straight down, the
+              shortest way, radians; modulo pi, because a parallel gripper is symmetric
     tilt      angle of the fingers off straight down, outwards from the arm's first joint, radians
     lean      the same, sideways
 
@@ -17,8 +17,8 @@ from lerobot_symview.kinematics.model import Array
 
 POSE = ("x", "y", "z", "yaw", "tilt", "lean")
 ANGLES = slice(3, 6)
-STEEP = 0.2  # least horizontal part of a direction whose yaw is known
-NEAR = 0.01  # metres from the vertical through the first joint, within which tilt is undefined
+UPWARDS = 0.9  # cosine of the angle to straight up, beyond which there is no shortest way down
+NEAR = 0.02  # metres from the vertical through the first joint, within which tilt is undefined
 
 
 def tool_poses(base_from_tool: Array, pivot: Array) -> Array:
@@ -34,17 +34,22 @@ def tool_poses(base_from_tool: Array, pivot: Array) -> Array:
     outwards = np.where(distance > 1e-9, outwards / np.maximum(distance, 1e-9), [1.0, 0.0])
     radial = (pointing[:, :2] * outwards).sum(axis=1)
     sideways = outwards[:, 0] * pointing[:, 1] - outwards[:, 1] * pointing[:, 0]
-    yaw = wrapped(np.arctan2(opening[:, 1], opening[:, 0]), np.pi)
+    # the shortest turn from `pointing` to straight down, about the horizontal axis between them, of `opening`
+    across = pointing[:, 0] * opening[:, 1] - pointing[:, 1] * opening[:, 0]
+    across /= np.maximum(1.0 - pointing[:, 2], 1e-9)
+    x = pointing[:, 0] * opening[:, 2] - pointing[:, 2] * opening[:, 0] - pointing[:, 1] * across
+    y = pointing[:, 1] * opening[:, 2] - pointing[:, 2] * opening[:, 1] + pointing[:, 0] * across
+    yaw = wrapped(np.arctan2(y, x), np.pi)
     tilt = np.arctan2(radial, -pointing[:, 2])
     lean = np.arctan2(sideways, np.hypot(radial, pointing[:, 2]))
     return np.concatenate([place, np.stack([yaw, tilt, lean], axis=1)], axis=1)
 
 
 def is_singular(base_from_tool: Array, pivot: Array) -> Array:
-    """Return whether yaw or tilt of tools (N, 4, 4) is undefined (N,): fingers open up and down, or over the pivot."""
-    steep = np.hypot(base_from_tool[:, 0, 0], base_from_tool[:, 1, 0]) < STEEP
+    """Return whether yaw or tilt of tools (N, 4, 4) is undefined (N,): fingers point up, or are over the pivot."""
+    upwards = base_from_tool[:, 2, 2] > UPWARDS
     near = np.hypot(*(base_from_tool[:, :2, 3] - pivot).T) < NEAR
-    return steep | near
+    return upwards | near
 
 
 def differences(poses: Array, reference: Array) -> Array:

@@ -135,5 +135,20 @@ def check_positions(arm: Arm, values: NDArray[np.floating], units: JointUnits) -
         raise KinematicsError(f"{'; '.join(each)}: {hint[units]}")
 
 
+def check_present(arm: Arm, positions: Array) -> None:
+    """Raise a KinematicsError if a robot's positions (N, J) are far outside the model's limits, or not finite."""
+    excess = np.maximum(arm.model.lower - positions, positions - arm.model.upper)
+    wrong = ~(excess <= np.where(arm.model.is_revolute, 2 * BEYOND, 0.02)).all(axis=0)
+    if wrong.any():
+        each = [
+            f"{arm.joints[index]} at {_shown(positions[:, index].max(), arm.model.is_revolute[index])}"
+            for index in np.flatnonzero(wrong)
+        ]
+        raise KinematicsError(
+            f"the robot gives {', '.join(each)} of the model, far outside its limits: its joints must have the order "
+            f"{', '.join(arm.state_names)} and the units of the recording"
+        )
+
+
 def _shown(position: float, turns: bool) -> str:
     return f"{np.rad2deg(position):.0f} degrees" if turns else f"{position:.3f} m"

@@ -10,6 +10,7 @@ from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfi
 from lerobot_policy_symview.encoders import register_encoder
 from lerobot_policy_symview.env_symview import FetchEnvConfig, MetaWorldEnvConfig, SymviewEnvConfig
 from lerobot_policy_symview.processor_allowlist import restrict_processor_steps
+from lerobot_policy_symview.processor_joints import JointsProcessorStep, JointTargetsProcessorStep
 from lerobot_policy_symview.processor_state import StateProcessorStep
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
 
@@ -17,6 +18,8 @@ restrict_processor_steps()
 
 __all__ = [
     "FetchEnvConfig",
+    "JointTargetsProcessorStep",
+    "JointsProcessorStep",
     "MetaWorldEnvConfig",
     "StateProcessorStep",
     "SymviewBcConfig",

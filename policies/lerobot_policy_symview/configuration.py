@@ -22,6 +22,7 @@ from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.geometry.gripper_state import gripper_columns, missing_of
 from lerobot_symview.geometry.state_reader import ORIGINS, StateOrigin, StateReader, origin_of
 from lerobot_symview.geometry.workspace import Workspace
+from lerobot_symview.kinematics import arm_from_plain
 from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
 from lerobot_symview.runtime.cli import flagged
@@ -40,6 +41,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "dtype": ("float32", "bfloat16"),
     "learning_rate_decay": ("none", "cosine"),
     "state_origin": ("None", *ORIGINS),
+    "unreachable": ("hold", "error"),
 }
 UNUSED_OUTPUTS = {"reproj": {"mask": False, "age": False}, "persp": {"gripper": False}}
 
@@ -120,6 +122,16 @@ class SymviewConfig(PreTrainedConfig):
     """Content of a calibration file, for observations without calibration; read from a dataset whose camera never
     moved."""
 
+    arm: dict[str, Any] = field(default_factory=dict)
+    """Arm whose joints the robot gives and takes, for a policy on the gripper's poses; read from a dataset that
+    `symview-convert-actions` made."""
+    max_joint_step: float = 10.0
+    """Degrees by which one action may send a joint away from where it is, with `arm`; a longer way is shortened."""
+    max_arm_error: float = 0.01
+    """Metres by which the joints may miss what an action asks for, with `arm`; a radian counts as 0.1 m."""
+    unreachable: Literal["hold", "error"] = "hold"
+    """What to do where they would miss it by more: `hold` the arm, or stop with an `error`."""
+
     check_camera: bool = False
     """Keep the camera's first image of the demonstrations, and compare the first observation with it: warn of a camera
     that was moved, and do not act on an image that shows something else, or on a black view. For a camera with one
@@ -165,6 +177,12 @@ class SymviewConfig(PreTrainedConfig):
             raise ValueError(f"--policy.learning_rate must be positive, got {self.learning_rate}")
         if not 0 <= self.camera_augmentation <= 10:
             raise ValueError(f"--policy.camera_augmentation must lie in [0, 10], got {self.camera_augmentation}")
+        for name in ("max_joint_step", "max_arm_error"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"--policy.{name} must be positive, got {getattr(self, name)}")
+        if self.arm:
+            with flagged("--policy.arm"):
+                arm_from_plain(self.arm)
         if not -3 <= self.origin_height <= 3:
             raise ValueError(f"--policy.origin_height must be metres, from -3 to 3, got {self.origin_height}")
         if not 0 <= self.relaxation_weight < math.inf:

@@ -11,8 +11,11 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.inputs.depth_reader import delivered_units
+from lerobot_policy_symview.processor_joints import JointsProcessorStep, JointTargetsProcessorStep
 from lerobot_policy_symview.processor_state import StateProcessorStep
 from lerobot_policy_symview.processor_views import ViewsProcessorStep
+
+OWN_STEPS = (JointsProcessorStep, StateProcessorStep, ViewsProcessorStep, JointTargetsProcessorStep)
 
 
 def make_processors(
@@ -22,10 +25,11 @@ def make_processors(
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
-    """Return LeRobot's default preprocessor and postprocessor with our steps added: the state, depth, and the views.
+    """Return LeRobot's default preprocessor and postprocessor with our steps: joints, the state, depth, and the views.
 
-    One reads states of other conventions, if the policy was trained with one. The other converts depth to metres and
-    renders the policy's view if an observation lacks it.
+    Two turn joints into the gripper's pose and actions into joints, if the policy was trained with an arm's. One reads
+    states of other conventions, if it was trained with one. One converts depth to metres and renders the policy's view
+    if an observation lacks it.
 
     Args:
         config: the policy's configuration.
@@ -42,6 +46,7 @@ def make_processors(
         input_steps=[
             steps.rename_observations,
             steps.add_batch_dim,
+            JointsProcessorStep(config.arm),
             StateProcessorStep(list(reader.names), list(reader.origin)),
             steps.to_device,
             ViewsProcessorStep(
@@ -56,7 +61,11 @@ def make_processors(
             ),
             steps.normalize,
         ],
-        output_steps=[steps.unnormalize, steps.to_cpu],
+        output_steps=[
+            steps.unnormalize,
+            steps.to_cpu,
+            JointTargetsProcessorStep(config.arm, config.max_joint_step, config.max_arm_error, config.unreachable),
+        ],
     )
 
 
@@ -66,8 +75,8 @@ def changed_options(config: SymviewConfig, saved: dict[str, dict[str, Any]]) -> 
     Steps and options that the checkpoint does not have yet had their defaults.
     """
     changed = []
-    for step in make_processors(config)[0].steps:
-        if isinstance(step, StateProcessorStep | ViewsProcessorStep):
+    for step in (step for pipeline in make_processors(config) for step in pipeline.steps):
+        if isinstance(step, OWN_STEPS):
             options, defaults = (json.loads(json.dumps(one.get_config())) for one in (step, type(step)()))
             known = saved.get(type(step)._registry_name, {})
             changed += [name for name, value in options.items() if known.get(name, defaults[name]) != value]

@@ -10,6 +10,7 @@ import pybullet
 import pybullet_data
 from lerobot.datasets import LeRobotDataset
 from pybullet_utils.bullet_client import BulletClient
+from scipy.spatial.transform import Rotation
 
 from lerobot_symview import keys
 from lerobot_symview.kinematics import Arm, arm_chain, read_urdf, solve
@@ -68,6 +69,17 @@ def mujoco_places(positions, file=SO101_MJCF, site="gripperframe"):
     return np.array(places), np.array(matrices)
 
 
+def yaws(pointing, opening):
+    """Angles about the vertical (N,) of the openings (N, 3) once the fingers are swung straight down, by SciPy."""
+    axis = np.cross(pointing, [0.0, 0.0, -1.0])
+    angle = np.arccos(np.clip(-pointing[:, 2], -1, 1))
+    length = np.linalg.norm(axis, axis=1)
+    swing = Rotation.from_rotvec(axis * (angle / np.maximum(length, 1e-12))[:, None])
+    swung = swing.apply(opening)
+    np.testing.assert_allclose(swing.apply(pointing), np.tile([0.0, 0.0, -1.0], (len(axis), 1)), atol=1e-6)
+    return np.arctan2(swung[:, 1], swung[:, 0])
+
+
 def bullet_places(positions, link="panda_grasptarget"):
     """Places (N, 3) and matrices (N, 3, 3) of a Panda's link by PyBullet's kinematics, of single precision."""
     client = BulletClient(pybullet.DIRECT)
@@ -95,7 +107,7 @@ def arm_recording(count=60, phase=0.0):
             0.06 * np.sin(1.3 * time),
             0.05 + 0.02 * np.sin(2 * time),
             0.4 * np.sin(time),
-            0.1 * np.sin(1.7 * time),
+            0.35 + 0.1 * np.sin(1.7 * time),
             np.zeros_like(time),
         ],
         axis=1,

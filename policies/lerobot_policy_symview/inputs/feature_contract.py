@@ -25,6 +25,7 @@ from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Camera, stored_camera
 from lerobot_symview.geometry.gripper_state import missing_of
 from lerobot_symview.geometry.state_reader import StateReader, is_end_effector
+from lerobot_symview.kinematics.arm import INCREMENT
 from lerobot_symview.views import View, ViewSpec
 
 Features = dict[str, dict[str, Any]]
@@ -44,6 +45,7 @@ def read_features(config: SymviewConfig, features: Features) -> None:
         ValueError: if the dataset lacks what the policy needs, or contradicts its declarations.
     """
     _check_vectors(config, features)
+    _read_arm(config, features)
     features = _own_names(config, features)
     _read_view(config, features)
     has_raw = all(key in features for key in config.all_raw_keys)
@@ -104,6 +106,14 @@ def _check_vectors(config: SymviewConfig, features: Features) -> None:
             config.state_names = recorded if is_end_effector(recorded) else []
     _name_state(config)
     config.check()  # options that depend on the types
+
+
+def _read_arm(config: SymviewConfig, features: Features) -> None:
+    """Take over the arm of a dataset whose joints were converted to increments of the gripper's pose."""
+    meaning = (features[keys.STATE].get("info") or {}).get("symview", {})
+    if "arm" in meaning and features[keys.ACTION].get("names") == list(INCREMENT):
+        config.arm = dict(meaning["arm"])
+        config.check()
 
 
 def _name_state(config: SymviewConfig) -> None:

@@ -23,7 +23,7 @@ from lerobot_symview.datasets.robot_flags import RobotFlags
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.kinematics import arm_from_plain
 from lerobot_symview.runtime.cli import CommandError
-from tests.helpers.arms import CAMERAS, JOINTS, NAMES, SO101, SO101_MJCF, arm_recording, mujoco_places, record_arm
+from tests.helpers.arms import CAMERAS, JOINTS, NAMES, SO101, SO101_MJCF, arm_recording, mujoco_places, record_arm, yaws
 from tests.helpers.datasets import contents
 
 FRAMES, EPISODES = 40, 2
@@ -72,7 +72,7 @@ def test_states_are_where_the_simulator_has_the_gripper_in_the_axes_of_the_base(
     state, aperture = columns_of(converted, keys.STATE)[0], np.clip(joints()[0][:, 5] / 100, 0, 1)
     places, matrices = mujoco_places(np.deg2rad(joints()[0][:, :5]))
     np.testing.assert_allclose(state[:, :3], places - [0.25, 0, -0.02], atol=1e-4)
-    yaw = np.arctan2(matrices[:, 1, 2], matrices[:, 0, 2])
+    yaw = yaws(matrices[:, :, 0], matrices[:, :, 2])
     assert np.rad2deg(np.abs(np.sin(state[:, 3] - yaw))).max() < 0.1
     np.testing.assert_allclose(state[:, 4], aperture, atol=1e-6)
     np.testing.assert_allclose(np.cos(state[:, 5]), -matrices[:, 2, 0], atol=1e-4)

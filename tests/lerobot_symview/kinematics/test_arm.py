@@ -8,7 +8,7 @@ import pytest
 from lerobot_symview.errors import KinematicsError
 from lerobot_symview.kinematics import arm_from_plain, check_positions, joint_scales, solve
 from lerobot_symview.kinematics.arm import APERTURE, pose_after
-from tests.helpers.arms import CENTER, JOINTS, NAMES, mujoco_places, so101, so101_arm
+from tests.helpers.arms import CENTER, JOINTS, NAMES, mujoco_places, so101, so101_arm, yaws
 
 MOTORS = {
     name: {"id": index, "drive_mode": 0, "homing_offset": 7, "range_min": 800, "range_max": 3300 - 100 * index}
@@ -30,8 +30,7 @@ def test_the_state_is_where_mujoco_has_the_gripper():
     places, matrices = mujoco_places(np.deg2rad(states[:, :5]))
     found = so101_arm().states(states)
     np.testing.assert_allclose(found[:, :3] + [*CENTER, 0], places, atol=1e-4)
-    opening = -matrices[:, :, 2]
-    difference = found[:, 3] - np.arctan2(opening[:, 1], opening[:, 0])
+    difference = found[:, 3] - yaws(matrices[:, :, 0], matrices[:, :, 2])
     np.testing.assert_allclose(np.sin(difference), 0, atol=1e-3)
     np.testing.assert_allclose(found[:, APERTURE], np.clip(states[:, 5] / 100, 0, 1))
 

@@ -80,6 +80,7 @@ def test_singular_poses_are_told():
     down[:3, :3], down[:3, 3] = np.diag([1.0, -1.0, -1.0]), [0.3, 0.0, 0.1]
     over = down.copy()
     over[:3, 3] = 0.0
-    upright = down.copy()
-    upright[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
-    assert is_singular(np.stack([down, over, upright]), np.zeros(2)).tolist() == [False, True, True]
+    up, level = down.copy(), down.copy()
+    up[:3, :3] = np.eye(3)
+    level[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # the rest of an arm: fingers ahead, opening up and down
+    assert is_singular(np.stack([down, over, up, level]), np.zeros(2)).tolist() == [False, True, True, False]
