@@ -8,6 +8,8 @@ import numpy as np
 
 from lerobot_symview.geometry.camera import Array
 
+LOOK_AHEAD = 0.3  # seconds
+
 
 @dataclass(frozen=True)
 class Control:
@@ -36,9 +38,13 @@ class Control:
     hold_steps: int
     finger_steps: int
 
-    def step_at(self, speed: float) -> float:
-        """Return the motion of an action at `speed`, metres per second, or at the experts' speed if that is lower."""
-        return min(speed, self.speed) / self.actions_per_second
+    def step_at(self, speed: float, by_hand: bool = False) -> float:
+        """Return the motion in one action at `speed`, metres per second, or at the experts' speed if that is lower.
+
+        A hand (`human_style`) follows a goal that runs ahead of it: then, the motion in the time that it plans ahead.
+        """
+        least = min(speed, self.speed)
+        return least * LOOK_AHEAD if by_hand else least / self.actions_per_second
 
     @property
     def limits(self) -> Array:

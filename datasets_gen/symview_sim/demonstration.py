@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,16 @@ EpisodeFrames = dict[str, NDArray[Any]]
 """Values of every feature, by dataset key; the first axis is the frame."""
 
 
+class Demonstration(NamedTuple):
+    """A successful episode."""
+
+    frames: EpisodeFrames
+    attempts: int
+    """Number of attempts, this one included."""
+    style: dict[str, Any]
+    """How the expert moved, as JSON values: the fields of a `Style`, or {} for a planner."""
+
+
 def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     """Return the environment's seed of an attempt at an episode of the recording `seed`.
 
@@ -29,8 +39,8 @@ def episode_seed(seed: int, episode: int, attempt: int = 0) -> int:
     return SEEDS_PER_RECORDING * (seed + 1) + SEEDS_PER_EPISODE * episode + attempt
 
 
-def demonstrate(settings: WorldSettings, seed: int, episode: int, noise: float) -> tuple[EpisodeFrames, int]:
-    """Return a successful episode and the number of attempts. The result depends on the arguments alone.
+def demonstrate(settings: WorldSettings, seed: int, episode: int, noise: float) -> Demonstration:
+    """Return a successful episode. The result depends on the arguments alone.
 
     Args:
         settings: the environment's; a process makes each environment once.
@@ -45,7 +55,8 @@ def demonstrate(settings: WorldSettings, seed: int, episode: int, noise: float) 
     for attempt in range(ATTEMPTS):
         frames = _attempt(env, episode_seed(seed, episode, attempt), noise)
         if frames is not None:
-            return {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}, attempt + 1
+            stacked = {key: np.stack([frame[key] for frame in frames]) for key in frames[0]}
+            return Demonstration(stacked, attempt + 1, env.episode_style)
     raise CommandError(
         f"the expert failed {ATTEMPTS} times in a row: lower --noise or --env.start_jitter, or raise --env.max_steps"
     )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import Any
+from dataclasses import asdict
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
+from lerobot_symview.runtime.staging import plain
 from symview_sim.camera_rig import CameraImages, EnvObservation
 from symview_sim.control import CONTROLS
+from symview_sim.human_style import Hand, Style, draw_style, human_action
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
@@ -57,6 +60,8 @@ class SymviewEnv(TableEnv):
         self._robot = lookup("robot", settings.robot, ROBOTS)
         self._scene: Scene | None = None
         self._steps = 0
+        self._style: Style | None = None
+        self._hand = self._next_hand = Hand()
         corners = self.workspace.corners()
         self._reach = [np.append(corner[:2], z) for corner, z in zip(corners[[0, 2]], GRIPPER_HEIGHTS, strict=True)]
 
@@ -73,6 +78,11 @@ class SymviewEnv(TableEnv):
         if self._scene is not None and not self._scene.arm.is_finite:
             self.close()  # Bullet keeps such numbers, whatever the joints are reset to
         self._steps = 0
+        self._hand = self._next_hand = Hand()
+        if self.settings.style == "human":  # from a generator of its own: the scene and the cameras stay the same
+            generator = cast(np.random.PCG64, self.np_random.bit_generator)  # Gymnasium's
+            style_rng = np.random.Generator(generator.jumped())
+            self._style = draw_style(style_rng, self.episode_task.ways, self.episode_task.mistakes)
         largest = self.settings.start_jitter
         jitter = self.np_random.uniform(-largest, largest, size=3)
         start = np.array([*self.workspace.center, START_HEIGHT]) + jitter
@@ -92,14 +102,25 @@ class SymviewEnv(TableEnv):
         *motion, aperture = self._clipped(action)
         arm.move(np.clip(arm.position + motion[:3], *self._reach), arm.yaw + motion[3], aperture)
         self._steps += 1
+        self._hand = self._next_hand
         success = bool(self.episode_task.is_success(self.scene))
         terminated = success or not self.episode_task.is_valid(self.scene)
         truncated = self._steps >= self._max_episode_steps and not terminated
         return self._observe(self._state()), float(success), terminated, truncated, {"is_success": success}
 
     def expert_action(self) -> NDArray[np.float32]:
-        """Return the expert's action in the current state, (5,) float32."""
-        return self._control.planned(self.episode_task.expert_action(self.scene)).astype(np.float32)
+        """Return the expert's action in the current state, and in the style of the episode, (5,) float32."""
+        if self._style is None:
+            return self._control.planned(self.episode_task.expert_action(self.scene)).astype(np.float32)
+        intent = self.episode_task.action_of_way(self.scene, self._style.way)
+        seconds, height = self._steps / self._control.actions_per_second, float(self.scene.arm.position[2])
+        action, self._next_hand = human_action(self._style, self._hand, seconds, intent, height, self._control)
+        return action.astype(np.float32)
+
+    @property
+    def episode_style(self) -> dict[str, Any]:
+        """The style of the episode's demonstration, as JSON values; {} for a planner's."""
+        return {} if self._style is None else plain(asdict(self._style))
 
     def close(self) -> None:
         """Shut the simulator down."""

@@ -14,6 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_symview import keys
+from lerobot_symview.datasets.action_targets import relative_action_feature
 from lerobot_symview.datasets.features import Features, camera_features
 from lerobot_symview.datasets.hub import push_dataset
 from lerobot_symview.datasets.metadata import RECORDING
@@ -43,6 +44,7 @@ EXAMPLES = """\
   symview-generate --root=data/anywhere --env.camera.spread.azimuth_deg=180 --env.camera.spread.elevation_deg=20
   symview-generate --dataset.repo_id=me/picking --dataset.push_to_hub=true --dataset.private=true
   symview-generate --root=data/push --env.type=metaworld --env.task=push-v3 --num_episodes=25
+  symview-generate --root=data/people --env.control=fine --env.style=human --num_episodes=100
   symview-generate --root=data/two --env.more_cameras='[{name: left, azimuth_deg: 90, height: 240, width: 320}]'"""
 
 
@@ -195,7 +197,7 @@ def _check_video_depth(env: TableEnv) -> None:
 def _features(env: TableEnv, config: GenerateConfig) -> Features:
     features: Features = {
         keys.STATE: _vector(config.env.state_names),
-        keys.ACTION: _vector(config.env.action_names),
+        keys.ACTION: relative_action_feature(config.env.action_names),
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},

@@ -14,7 +14,7 @@ LAST_ACTION = 0.05  # metres: the last action of a straight path to an object; a
 LIFT = np.array([0.0, 0.0, CLEARANCE, 0.0])
 
 
-def grasp(scene: Scene, cube: int, from_above: bool) -> Array:
+def grasp(scene: Scene, cube: int, from_above: bool, faces: int | None = None) -> Array:
     """Return the action (5,) that approaches a cube, aligns the gripper's yaw, and closes on arrival.
 
     Args:
@@ -22,11 +22,15 @@ def grasp(scene: Scene, cube: int, from_above: bool) -> Array:
         cube: body id.
         from_above: whether to descend only once the gripper is above the cube. Use it where the straight path could
             collide with another object. Short actions always do so.
+        faces: pair of the cube's faces to grasp it by: 0 those along its x axis, 1 along y; None the nearer pair.
     """
     position, yaw = scene.pose(cube)
-    yaw_change = yaw_difference(scene.arm.yaw, yaw, period=np.pi / 2)
-    aside = np.abs(scene.arm.position[:2] - position[:2]).max()
-    if (from_above or scene.control.step < LAST_ACTION) and aside > 0.02:
+    if faces is None:
+        yaw_change = yaw_difference(scene.arm.yaw, yaw, period=np.pi / 2)
+    else:
+        yaw_change = yaw_difference(scene.arm.yaw, yaw + faces * np.pi / 2, period=np.pi)
+    is_aside = np.abs(scene.arm.position[:2] - position[:2]).max() > 0.02 or abs(yaw_change) > np.pi / 4
+    if (from_above or scene.control.step < LAST_ACTION) and is_aside:
         return np.append(motion_to(scene.arm.position, position + [0, 0, CLEARANCE], yaw_change), OPEN)
     motion = motion_to(scene.arm.position, position, yaw_change)
     return np.append(motion, CLOSED if scene.control.arrives(motion) else OPEN)

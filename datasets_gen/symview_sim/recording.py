@@ -24,15 +24,17 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from lerobot_symview.datasets.features import Features
-from lerobot_symview.datasets.metadata import RECORDING
+from lerobot_symview.datasets.metadata import EPISODE_STYLE, RECORDING
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of, plain
 from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import WorldSettings
 
 SHARD_EPISODES, MAX_SHARDS = 25, 32
-ATTEMPTS_KEY = "attempts"
+ATTEMPTS_KEY, STYLE_KEY = "attempts", "style"
 ROBOT_TYPE = "symview"  # of every arm: states and actions are the gripper's, so recordings of different arms merge
 # With its default block size and B-frames, x265 changed pixels of 85 of 1,080 noisy depth images despite `lossless`.
 LOSSLESS = "lossless=1:ctu=16:bframes=0"
@@ -79,10 +81,10 @@ class Recording:
 
 def record_episode(recording: Recording, episode: int) -> int:
     """Simulate an episode, write its file and return the number of attempts."""
-    frames, attempts = demonstrate(recording.env, recording.seed, episode, recording.noise)
+    frames, attempts, style = demonstrate(recording.env, recording.seed, episode, recording.noise)
     file = recording.episode_file(episode)
     part = part_of(file)
-    content: dict[str, Any] = {**frames, ATTEMPTS_KEY: attempts}
+    content: dict[str, Any] = {**frames, ATTEMPTS_KEY: attempts, STYLE_KEY: json.dumps(style)}
     try:
         with disk_errors(recording.folder):
             file.parent.mkdir(exist_ok=True)
@@ -118,10 +120,20 @@ def write_shard(recording: Recording, shard: range) -> Path:
                     raise OSError(failures[0])
             dataset.save_episode(parallel_encoding=False)
         dataset.finalize()
+        _add_styles(recording, shard, part)
         shutil.rmtree(part / "images")  # LeRobot does not remove its empty temporary folders
         if not folder.exists():  # a cluster repeats the work of a worker that it has lost
             part.rename(folder)
     return folder
+
+
+def _add_styles(recording: Recording, shard: range, folder: Path) -> None:
+    """Add the style of each episode to a shard's table of episodes, unless the episodes have none."""
+    styles = [_style(recording.episode_file(episode)) for episode in shard]
+    for file in sorted((folder / "meta" / "episodes").rglob("*.parquet")) if any(styles) else ():
+        table = pq.read_table(file)
+        column = [json.dumps(styles[index]) for index in table["episode_index"].to_pylist()]
+        pq.write_table(table.append_column(EPISODE_STYLE, pa.array(column)), file)
 
 
 def join_shards(recording: Recording, shards: list[Path]) -> None:
@@ -180,9 +192,14 @@ def _create_dataset(recording: Recording, root: Path) -> Any:
     )
 
 
+def _style(file: Path) -> dict[str, Any]:
+    with np.load(file) as content:
+        return json.loads(str(content[STYLE_KEY]))
+
+
 def _frames(file: Path) -> Iterator[EpisodeFrames]:
     with np.load(file) as content:
-        episode = {key: content[key] for key in content.files if key != ATTEMPTS_KEY}
+        episode = {key: content[key] for key in content.files if key not in (ATTEMPTS_KEY, STYLE_KEY)}
     for index in range(len(next(iter(episode.values())))):
         yield {key: values[index] for key, values in episode.items()}
 

@@ -14,7 +14,7 @@ from lerobot_symview.datasets.hub import HubOptions
 from lerobot_symview.errors import OptionError
 from lerobot_symview.geometry.placement import CameraSpec, top_camera
 from lerobot_symview.geometry.workspace import Workspace
-from lerobot_symview.registry import lookup
+from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime.cli import DatasetLocation
 from symview_sim.control import CONTROLS
 from symview_sim.robots import ROBOTS
@@ -23,6 +23,8 @@ from symview_sim.tasks import TASK_NAMES, check_task
 if TYPE_CHECKING:
     from symview_sim.env import SymviewEnv
     from symview_sim.table_env import TableEnv
+
+STYLES = ("planner", "human")
 
 
 # Not frozen, because the plugin's environment configurations derive from these classes and from LeRobot's EnvConfig,
@@ -122,7 +124,7 @@ class EnvSettings(WorldSettings):
     """A task, a robot arm, the workspace and the cameras of a PyBullet environment.
 
     Raises:
-        OptionError: as `WorldSettings`, or if the task, robot or control is unknown.
+        OptionError: as `WorldSettings`, or if the task, robot, control or style is unknown.
     """
 
     task: str = "block_picking"
@@ -136,6 +138,9 @@ class EnvSettings(WorldSettings):
     control: str = "coarse"
     """`coarse`: 4 actions a second, each at most 5 cm and 45 degrees, 50 an episode; `fine`: 10 a second, 1.5 cm and 15
     degrees, 200 an episode."""
+    style: str = "planner"
+    """`planner`: the expert moves straight and the state determines its action; `human`: in every episode it has
+    another pace and path, pauses, chooses one of the task's ways, corrects itself, and now and then makes a mistake."""
     start_jitter: float = 0.0
     """Largest random displacement of the gripper's start position per axis, metres."""
 
@@ -147,6 +152,7 @@ class EnvSettings(WorldSettings):
             check_task(self.task)
             lookup("robot", self.robot, ROBOTS)
             lookup("control", self.control, CONTROLS)
+            check_name("style", self.style, STYLES)
         except ValueError as error:
             raise OptionError(str(error)) from None
         if not 0 <= self.start_jitter < math.inf:

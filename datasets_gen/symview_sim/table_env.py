@@ -74,6 +74,11 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def expert_action(self) -> NDArray[np.float32]:
         """Return the expert's action in the current state."""
 
+    @property
+    def episode_style(self) -> dict[str, Any]:
+        """How the episode is demonstrated, as JSON values; {} if the state determines the expert's actions."""
+        return {}
+
     def render(self) -> NDArray[np.uint8]:
         """Return the first camera's image, (256, W, 3) uint8."""
         spec = self.specs[0]

@@ -88,6 +88,8 @@ def _recorded(recording: dict[str, Any]) -> str:
     sentences = [
         f"A scripted expert performs `{env['task']}` with a {env['robot']} arm in PyBullet, seed {recording['seed']}."
     ]
+    if env.get("style") == "human":
+        sentences.append("It moves as people do, each episode in a style of its own (`symview_style` in its metadata).")
     if recording["noise"]:
         deviation = f"a standard deviation of {recording['noise']:g} of the largest action"
         sentences.append(f"Noise with {deviation} is added to its actions; the recorded actions are without noise.")

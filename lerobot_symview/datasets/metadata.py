@@ -4,6 +4,7 @@
     meta/symview_recording.json     settings of a simulated recording and its expert's success rate, optional
     meta/symview_views.json         settings of `symview-add-views`, optional
     meta/symview_conversion.json    settings of `symview-convert-actions`, optional
+    meta/episodes/*/*.parquet       LeRobot's; `symview_style` is how each episode was demonstrated, JSON, optional
 
 LeRobot merges only datasets whose features are equal. Hence the features hold nothing that may differ between
 recordings: the calibration is in columns, the rest in our own files, which LeRobot's tools do not copy.
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ COUNTS = {"total_episodes": 0, "total_frames": 0, "chunks_size": 1}  # least val
 NUMBERS = r"\{(?:chunk|file)_index(?::0[1-9]d)?\}"
 TEMPLATES = {"data_path": NUMBERS, "video_path": rf"{NUMBERS}|\{{video_key\}}"}
 RECORDING, ADDED_VIEWS, CONVERSION = "symview_recording.json", "symview_views.json", "symview_conversion.json"
+EPISODE_STYLE = "symview_style"  # column of the episodes' metadata
 
 
 def read_info(folder: Path) -> dict[str, Any]:
@@ -54,6 +56,30 @@ def read_settings(folder: Path, name: str) -> dict[str, Any]:
     """
     file = folder / "meta" / name
     return _read_object(file) if file.is_file() else {}
+
+
+def episode_styles(episodes: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return how each episode was demonstrated; {} where the dataset does not say.
+
+    Args:
+        episodes: rows of `meta/episodes`, such as `SourceDataset.episodes` or `LeRobotDataset.meta.episodes`.
+
+    Raises:
+        DatasetError: if a style is not a JSON object.
+    """
+    return [_style(row.get(EPISODE_STYLE)) for row in episodes]
+
+
+def _style(text: Any) -> dict[str, Any]:
+    if text is None:
+        return {}
+    try:
+        style = json.loads(text)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise DatasetError(f"cannot read an episode's {EPISODE_STYLE} {str(text)[:200]!r}: {error}") from None
+    if not isinstance(style, dict):
+        raise DatasetError(f"an episode's {EPISODE_STYLE} must hold an object, got {type(style).__name__}")
+    return style
 
 
 def _read_object(file: Path) -> dict[str, Any]:

@@ -55,9 +55,10 @@ def test_preprocessor_adds_the_views():
 
 
 def test_fine_control_gives_lerobot_its_rate_and_episode_length():
-    config = SymviewEnvConfig(camera=SMALL, control="fine")
+    config = SymviewEnvConfig(camera=SMALL, control="fine", style="human")
     env = config.create_envs(2)["block_picking"][0]
     assert (config.fps, env.call("_max_episode_steps")) == (10, (200, 200))
+    assert env.envs[0].unwrapped.settings == EnvSettings(camera=SMALL, control="fine", style="human")
     assert env.single_action_space.high[0] == pytest.approx(0.015)
     with pytest.raises(FlagError, match=r"--env\.fps=4: the simulator takes 10 actions a second"):
         SymviewEnvConfig(control="fine", fps=4)

@@ -112,6 +112,7 @@ WRONG = {
         "workspace.size": (0.0, "env.*workspace size and height_limit must be positive metres, got 0 and 0.25"),
         "workspace.height_limit": (0.0, "env.*workspace size and height_limit must be positive.*got 0.4 and 0"),
         "control": ("fines", "--env: unknown control 'fines'.*did you mean 'fine'"),
+        "style": ("humane", "--env: unknown style 'humane'.*did you mean 'human'"),
         "start_jitter": (-0.1, "--env: start_jitter must not be negative, got -0.1"),
         "max_steps": (0, "--env: max_steps must be at least 1, got 0"),
         "views": (["repro"], "--env: unknown view 'repro'.*did you mean 'reproj'"),

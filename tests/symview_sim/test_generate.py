@@ -12,9 +12,15 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.dataset_tools import merge_datasets
 
 from lerobot_symview import keys
-from lerobot_symview.datasets.metadata import RECORDING, read_settings
+from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
+from lerobot_symview.datasets.card import dataset_card
+from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.datasets.metadata import EPISODE_STYLE, RECORDING, episode_styles, read_settings
+from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.errors import DatasetError
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
@@ -127,7 +133,7 @@ def test_video_is_lossless_in_rgb_and_within_a_fifth_of_a_millimetre_in_depth(tm
     dataset = LeRobotDataset("test/small", root=folder, depth_output_unit="m", video_backend="pyav")
     videos = {key for key, feature in dataset.meta.features.items() if feature["dtype"] == "video"}
     assert videos == set(dataset.meta.camera_keys) - {keys.depth("top")}
-    episode, _ = demonstrate(env, 0, 0, 0.0)
+    episode = demonstrate(env, 0, 0, 0.0).frames
     for index in range(len(dataset)):
         item = dataset[index]
         for key in dataset.meta.camera_keys:
@@ -156,10 +162,40 @@ def test_a_ray_cluster_writes_the_same_data(reference, tmp_path):
     assert_same_data(generate(config(tmp_path / "data", num_workers=2, executor="ray")), reference)
 
 
+def test_every_episode_names_its_style(small_shards, tmp_path):
+    """Through shards, whichever worker simulated, a merge with a planner's episodes, and added views."""
+    env = replace(SMALL, control="fine", style="human")
+    alone = generate(config(tmp_path / "alone", env=env, num_episodes=3))
+    parallel = generate(config(tmp_path / "parallel", env=env, num_episodes=3, num_workers=2))
+    assert_same_data(alone, parallel)
+    expected = [demonstrate(env, 0, episode, 0.0).style for episode in range(3)]
+    dataset = LeRobotDataset("test/small", root=alone)
+    assert dataset.fps == 10
+    assert episode_styles(dataset.meta.episodes) == expected
+    assert len({str(style) for style in expected}) == 3
+    assert "It moves as people do" in dataset_card(SourceDataset(alone), "test/small", [], has_image=False)
+    planner = generate(config(tmp_path / "planner", env=replace(SMALL, control="fine"), num_episodes=1))
+    planned = LeRobotDataset("test/small", root=planner)
+    assert EPISODE_STYLE not in planned.meta.episodes.column_names
+    merge_datasets([planned, dataset], output_repo_id="test/both", output_dir=tmp_path / "both")
+    source = HubDataset("test/both", tmp_path / "both")
+    viewed = add_views(AddViewsConfig(source, new_repo_id="test/viewed", new_root=tmp_path / "viewed", size=32))
+    for folder in (source.root, viewed):
+        assert episode_styles(SourceDataset(folder).episodes) == [{}, *expected]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("{", "cannot read"), (3, "cannot read"), ("[1]", "must hold an object, got list")]
+)
+def test_a_style_that_is_no_object_is_an_error(text, message):
+    with pytest.raises(DatasetError, match=message):
+        episode_styles([{EPISODE_STYLE: text}])
+
+
 def test_an_expert_with_noise_repeats_until_it_succeeds(small_shards, tmp_path):
     """The number of attempts depends on the episode, not on the worker."""
     folder = generate(config(tmp_path / "data", num_episodes=3, noise=0.9))
-    attempts = [demonstrate(SMALL, 0, episode, 0.9)[1] for episode in range(3)]
+    attempts = [demonstrate(SMALL, 0, episode, 0.9).attempts for episode in range(3)]
     assert sum(attempts) > 3
     assert read_settings(folder, RECORDING)["expert_success_rate"] == pytest.approx(3 / sum(attempts))
 
@@ -206,7 +242,7 @@ def test_leftovers_of_an_interrupted_clean_up_are_ignored(small_shards, tmp_path
     (plan.folder / "request.json").rename(plan.folder / "request.json.done")
     folder = generate(config(tmp_path / "data", num_episodes=1, seed=1))
     starts = LeRobotDataset("test/small", root=folder)[0][keys.ACTION].numpy()
-    np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0)[0][keys.ACTION][0])
+    np.testing.assert_array_equal(starts, demonstrate(SMALL, 1, 0, 0.0).frames[keys.ACTION][0])
 
 
 def test_resuming_a_complete_recording_does_nothing(reference):
@@ -221,6 +257,7 @@ def test_a_recording_killed_at_any_time_resumes_and_writes_the_same_data(tmp_pat
     """Two workers are killed during simulation, during writing and at random times."""
     root, partial = tmp_path / "data", tmp_path / "data.partial"
     command = [COMMAND, f"--root={root}", "--num_episodes=6", "--num_workers=2", "--resume=true"]
+    command += ["--env.control=fine", "--env.style=human"]
     command += ["--env.oracle=false", "--env.camera.height=32", "--env.camera.width=32", "--dataset.repo_id=test/small"]
     dice = random.Random(0)
     milestones = [lambda n=n: len(list(partial.glob("episodes/*.npz"))) >= n for n in (1, 4)]
@@ -243,7 +280,8 @@ def test_a_recording_killed_at_any_time_resumes_and_writes_the_same_data(tmp_pat
         kept = len(episodes)
     subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setattr(recording, "SHARD_EPISODES", 25)  # as the command has it
-    expected = generate(config(tmp_path / "expected", num_episodes=6))
+    env = replace(SMALL, control="fine", style="human")
+    expected = generate(config(tmp_path / "expected", env=env, num_episodes=6))
     assert_same_data(root, expected)
 
 

@@ -41,10 +41,11 @@ def test_the_control_sets_the_rate_and_the_length_of_an_episode():
     assert replace(coarse, control="fine") == fine
 
 
+@pytest.mark.parametrize("flag", ["control=fine", "style=human"])
 @pytest.mark.parametrize("kind", ["metaworld", "fetch"])
-def test_other_simulators_have_no_control(kind):
-    with pytest.raises(draccus.utils.DecodingError, match="`control` are not valid for Recorded"):
-        draccus.parse(GenerateConfig, args=[f"--env.type={kind}", "--env.control=fine"])
+def test_other_simulators_have_no_control_and_no_style(kind, flag):
+    with pytest.raises(draccus.utils.DecodingError, match=f"`{flag.split('=')[0]}` are not valid for Recorded"):
+        draccus.parse(GenerateConfig, args=[f"--env.type={kind}", f"--env.{flag}"])
 
 
 def test_a_recording_has_the_oracle_by_default():
@@ -81,6 +82,7 @@ def test_the_task_happens_in_the_workspace():
         ({"task": "block_piking"}, "unknown task 'block_piking'.*did you mean 'block_picking'"),
         ({"robot": "pandas"}, "unknown robot 'pandas'.*did you mean 'panda'"),
         ({"control": "fines"}, "unknown control 'fines'.*did you mean 'fine'"),
+        ({"style": "humane"}, "unknown style 'humane'.*did you mean 'human'"),
         ({"start_jitter": -0.1}, "start_jitter must not be negative, got -0.1"),
         ({"max_steps": 0}, "max_steps must be at least 1, got 0"),
         ({"more_cameras": (SIDE,)}, "cameras must differ in their names, got side, side"),

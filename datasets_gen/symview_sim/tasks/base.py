@@ -19,6 +19,11 @@ class Task(ABC):
 
     instruction: ClassVar[str]
     """The task in words, which datasets store and language-conditioned policies read."""
+    ways: ClassVar[int] = 1
+    """Number of ways to solve the task from which a person may choose, such as the two pairs of faces of a cube. A
+    reflection of the scene may exchange ways, as left and right."""
+    mistakes: ClassVar[tuple[str, ...]] = ("wrong_place",)
+    """Mistakes that a person may make (`human_style.Style.mistake`)."""
 
     @abstractmethod
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
@@ -38,3 +43,10 @@ class Task(ABC):
 
         The motion may be longer than an action; the environment shortens it to the speed of `scene.control`.
         """
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Return what a person does in the current state to solve the task in one of its `ways`, 0 to `ways` - 1.
+
+        As `expert_action`, but the choice is the way's: the state alone does not determine the action.
+        """
+        return self.expert_action(scene)

@@ -22,6 +22,8 @@ class BlockInBowl(Task):
     """A red cube and a yellow bowl; solved when the cube lies in the upright bowl and is released."""
 
     instruction = "Put the red block into the bowl."
+    ways = 2  # pairs of faces
+    mistakes = ("wrong_place", "early_close")
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
         """Place the cube and the bowl more than 17 cm apart."""
@@ -40,12 +42,19 @@ class BlockInBowl(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Grasp the cube, carry it above the bowl and release it."""
+        return self._action(scene)
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Do the same by one pair of the cube's faces."""
+        return self._action(scene, faces=way)
+
+    def _action(self, scene: Scene, faces: int | None = None) -> Array:
         if self._lies_inside(scene):
             return np.append(LIFT, OPEN)
         if scene.arm.holds(self._cube):
             goal = np.array([*scene.pose(self._bowl)[0][:2], RELEASE])
             return carry(scene, goal, 0.0, TRAVEL)
-        return grasp(scene, self._cube, from_above=True)
+        return grasp(scene, self._cube, from_above=True, faces=faces)
 
     def _lies_inside(self, scene: Scene) -> bool:
         offset = scene.pose(self._cube)[0][:2] - scene.pose(self._bowl)[0][:2]

@@ -18,6 +18,8 @@ class BlockPicking(Task):
     """A red cube lies anywhere in the workspace; solved when the gripper holds it 15 cm above the table."""
 
     instruction = "Pick up the red block."
+    ways = 2  # pairs of faces
+    mistakes = ("wrong_place", "early_close")
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
         """Place the cube uniformly at random, its yaw within 45 degrees either way."""
@@ -35,9 +37,16 @@ class BlockPicking(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Approach the cube in a straight line, or from above in short actions, close on arrival and lift it."""
+        return self._action(scene, from_above=False)
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Do the same from above, by one pair of the cube's faces."""
+        return self._action(scene, from_above=True, faces=way)
+
+    def _action(self, scene: Scene, from_above: bool, faces: int | None = None) -> Array:
         if scene.arm.holds(self._cube):
             return np.append(LIFT, CLOSED)
-        return grasp(scene, self._cube, from_above=False)
+        return grasp(scene, self._cube, from_above, faces)
 
 
 TASK = BlockPicking

@@ -21,6 +21,7 @@ class BlockPushing(Task):
     """A red cube and a blue square lie in the workspace; solved when their centres are within 5 cm."""
 
     instruction = "Push the red block onto the blue square."
+    ways = 2  # the fingers side by side, or one before the other
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
         """Place the cube and the square more than 9 cm apart."""
@@ -40,11 +41,18 @@ class BlockPushing(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Sweep with a half-open gripper along the line from the cube to the square."""
+        return self._action(scene, turn=0.0, by_hand=False)
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Push with both fingers, or with the gripper turned by 90 degrees and one of them."""
+        return self._action(scene, way * np.pi / 2, by_hand=True)
+
+    def _action(self, scene: Scene, turn: float, by_hand: bool) -> Array:
         cube, goal = scene.pose(self._cube)[0][:2], scene.pose(self._goal)[0][:2]
         along = (goal - cube) / np.linalg.norm(goal - cube)
         start = scene.clip_to_workspace(cube - BEHIND * along)
-        step = scene.control.step_at(scene.control.speed)
-        motion = sweep(scene.arm.position, scene.arm.yaw, start, goal - SHORT * along, HEIGHT, step)
+        step = scene.control.step_at(scene.control.speed, by_hand)
+        motion = sweep(scene.arm.position, scene.arm.yaw - turn, start, goal - SHORT * along, HEIGHT, step)
         return np.append(motion, 0.5)
 
 

@@ -22,6 +22,8 @@ class BlockStacking(Task):
     """Two red cubes lie in the workspace; solved when one rests on the other, released and stable."""
 
     instruction = "Stack the red blocks."
+    ways = 4  # either cube first, by either pair of its faces
+    mistakes = ("wrong_place", "early_close")
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
         """Place the cubes more than 12 cm apart."""
@@ -46,6 +48,14 @@ class BlockStacking(Task):
 
     def expert_action(self, scene: Scene) -> Array:
         """Grasp the nearer cube, carry it above the other, release it and rise."""
+        distances = [np.linalg.norm(scene.arm.position[:2] - scene.pose(cube)[0][:2]) for cube in self._cubes]
+        return self._action(scene, self._cubes[int(np.argmin(distances))])
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Do the same with one of the cubes, by one pair of its faces."""
+        return self._action(scene, self._cubes[way // 2], faces=way % 2)
+
+    def _action(self, scene: Scene, first: int, faces: int | None = None) -> Array:
         if self._stands(scene):
             return np.append(LIFT, OPEN)
         held = [cube for cube in self._cubes if scene.arm.holds(cube)]
@@ -54,8 +64,7 @@ class BlockStacking(Task):
             base, yaw = scene.pose(other)
             goal = base + [0, 0, RELEASE]
             return carry(scene, goal, yaw_difference(scene.arm.yaw, yaw, period=np.pi / 2), TRAVEL)
-        distances = [np.linalg.norm(scene.arm.position[:2] - scene.pose(cube)[0][:2]) for cube in self._cubes]
-        return grasp(scene, self._cubes[int(np.argmin(distances))], from_above=True)
+        return grasp(scene, first, from_above=True, faces=faces)
 
     def _stands(self, scene: Scene) -> bool:
         lower, upper = sorted((scene.pose(cube)[0] for cube in self._cubes), key=lambda position: position[2])

@@ -16,12 +16,14 @@ TRAVEL = 0.2  # metres: the drawer's end stop
 BEHIND = 0.028  # metres behind the bar's centre, where the fingers descend: the middle of the gap
 PULL, PULL_SPEED = 0.2, 0.16  # metres, and metres per second
 HEIGHT = 0.034
+ASIDE = 0.02  # metres from the middle of the bar, where a person hooks it
 
 
 class DrawerOpening(Task):
     """A cabinet with one drawer stands at a random pose; solved when the drawer is 15 cm open."""
 
     instruction = "Open the drawer."
+    ways = 2  # left and right half of the handle
 
     def spawn(self, scene: Scene, rng: np.random.Generator) -> None:
         """Place the cabinet in a random orientation, with its handle near the workspace's centre."""
@@ -40,12 +42,18 @@ class DrawerOpening(Task):
         return True
 
     def expert_action(self, scene: Scene) -> Array:
-        """Descend behind the handle with closed fingers, then pull."""
+        """Descend behind the middle of the handle with closed fingers, then pull."""
+        return self._action(scene, 0.0, scene.control.step_at(PULL_SPEED))
+
+    def action_of_way(self, scene: Scene, way: int) -> Array:
+        """Do the same on the left or the right of the handle."""
+        return self._action(scene, (ASIDE, -ASIDE)[way], scene.control.step_at(PULL_SPEED, by_hand=True))
+
+    def _action(self, scene: Scene, aside: float, step: float) -> Array:
         cabinet, yaw = scene.pose(self._cabinet)
         inward = np.array([np.cos(yaw), np.sin(yaw)])
         bar = cabinet[:2] - (HANDLE_REACH + scene.opening(self._cabinet)) * inward
-        start = bar + BEHIND * inward
-        step = scene.control.step_at(PULL_SPEED)
+        start = bar + BEHIND * inward + aside * np.array([-inward[1], inward[0]])
         motion = sweep(scene.arm.position, scene.arm.yaw, start, start - PULL * inward, HEIGHT, step)
         return np.append(motion, CLOSED)
 
