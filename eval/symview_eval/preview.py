@@ -33,6 +33,7 @@ from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
 from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
 from symview_eval.drift_check import check_drift, check_image
+from symview_eval.gripper_path import GripperPath, read_path
 from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ SMALLEST_TRAINED = 76  # pixels of a view that a policy takes, with a crop of 64
 
 @dataclass(frozen=True)
 class PreviewConfig:
-    """Show frames of a dataset: the camera's image with the workspace drawn in, the views and their masks.
+    """Show frames of a dataset: the camera's image with the workspace and the gripper's path, the views, their masks.
 
     Writes a contact sheet (preview.png, preview.html) and, with rerun, preview.rrd. Warns about a camera that sees too
     little of the workspace, views with many inferred pixels, and a camera whose resolution is too low for the views.
@@ -186,6 +187,7 @@ def preview(config: PreviewConfig) -> Path:
         length = source.episodes[episode]["length"]
         indices = np.unique(np.linspace(0, length - 1, config.frames).round().astype(int)).tolist()
         renderers = [view.with_mask().start_episode() for view in views.values()]
+        path = read_path(reader, episode) if reader is not None else None
         needed = range(indices[-1] + 1) if any(view.memory for view in views.values()) else indices
         for sample in read_samples(source, reader, episode, needed):
             if sample.frame is None or reader is None:
@@ -196,7 +198,7 @@ def preview(config: PreviewConfig) -> Path:
             if sample.index not in indices:
                 continue
             measures = _measure(sample.frame.camera, reader.workspace, made)
-            rows.append(_row(config.camera, sample, sample.frame, made, measures))
+            rows.append(_row(config.camera, sample, sample.frame, made, measures, path))
             measured.append(measures)
             if recording is not None:
                 stored = {name: sample.stored[name] for name in _stored_views(source.features)}
@@ -277,7 +279,14 @@ def _measure(camera: Camera, workspace: Workspace, made: dict[str, NDArray]) -> 
     return Measures(workspace.visible_fraction(camera), table_resolution(camera, workspace), holes)
 
 
-def _row(name: str, sample: FrameSample, frame: Frame, made: dict[str, NDArray], measures: Measures) -> SheetRow:
+def _row(
+    name: str,
+    sample: FrameSample,
+    frame: Frame,
+    made: dict[str, NDArray],
+    measures: Measures,
+    path: GripperPath | None,
+) -> SheetRow:
     offset = frame.camera.position - [*frame.workspace.center, 0.0]
     distance = float(np.linalg.norm(offset))
     elevation, azimuth = np.rad2deg([np.arcsin(offset[2] / distance), np.arctan2(offset[1], offset[0])])
@@ -293,6 +302,12 @@ def _row(name: str, sample: FrameSample, frame: Frame, made: dict[str, NDArray],
         by_origin = {origin: known[key] for origin, known in (("stored", others), ("computed", made)) if key in known}
         for origin, image in by_origin.items():
             images[f"{key}, {origin}" if len(by_origin) > 1 else key] = _displayable(image)
+    if path is not None:
+        label, image = next(iter(outlined.items()))
+        outlined = {label: path.in_camera(image, frame.camera, sample.index)}
+        views = [key for key in (f"{name}_reproj", f"{name}_persp") if key in others | made]
+        if views:
+            outlined["the gripper's path"] = path.on_view(_displayable((others | made)[views[0]]), sample.index)
     return SheetRow(sample.title, facts, outlined | images)
 
 
