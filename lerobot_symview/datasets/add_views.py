@@ -6,25 +6,16 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.calibration.readings import PoseReading, ReadingError
 from lerobot_symview.datasets.calibration_check import check_calibration, with_depth_units
-from lerobot_symview.datasets.derivation import (
-    cut_parts,
-    derived_schema,
-    finish,
-    source_fingerprint,
-    write_part,
-)
+from lerobot_symview.datasets.derivation import derived_schema, source_fingerprint, write_dataset
 from lerobot_symview.datasets.features import (
     Features,
     calibration_features,
@@ -46,7 +37,7 @@ from lerobot_symview.geometry.visibility import check_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
-from lerobot_symview.runtime.staging import is_complete, new_result, partial_folder, plain
+from lerobot_symview.runtime.staging import is_complete, partial_folder, plain
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
 
@@ -166,22 +157,16 @@ def _write(config: AddViewsConfig) -> Path:
         source = SourceDataset(config.dataset.folder())
     target = config.target().folder()
     check_apart(source.folder, target)
-    executor = EXECUTORS["local"](
-        config.num_workers, "lerobot_symview.datasets.view_derivation"
-    )  # starts while this plans
+    executor = EXECUTORS["local"](config.num_workers, ViewDerivation.__module__)  # starts while this plans
     derivation = _plan(config, source, partial_folder(target))
     description = _description(config, derivation)
     if is_complete(target, ADDED_VIEWS, description, config.resume, "--new_root"):
         logger.info("%s is already complete", target)
         return target
     _check_first_frame(derivation, source)
-    parts, names, frames = cut_parts(source), ", ".join(derivation.views), source.info["total_frames"]
-    with new_result(target, description, config.resume, "--new_root"):
-        with executor, tqdm(desc=names, total=frames, unit="frame") as bar:
-            for count in executor.run(partial(write_part, derivation), list(enumerate(parts))):
-                bar.update(count)
-        finish(derivation, parts, description, ADDED_VIEWS)
-    logger.info("wrote %d frames with %s to %s", frames, names, target)
+    names = ", ".join(derivation.views)
+    write_dataset(derivation, executor, target, names, description, ADDED_VIEWS, config.resume)
+    logger.info("wrote %d frames with %s to %s", source.info["total_frames"], names, target)
     return target
 
 

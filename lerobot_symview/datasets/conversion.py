@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from lerobot_symview import keys
-from lerobot_symview.datasets.derivation import Derivation
+from lerobot_symview.datasets.derivation import Derivation, Derive
 from lerobot_symview.datasets.features import Features, calibration_features
 from lerobot_symview.datasets.image_statistics import ImageStatistics, vector_summary
 from lerobot_symview.datasets.source import SourceDataset, vectors
@@ -44,7 +44,11 @@ class Conversion(Derivation):
         """The joints and their targets."""
         return [keys.STATE, keys.ACTION]
 
-    def derive(self, episode: int, table: pa.Table) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
+    def deriver(self) -> Derive:
+        """Return what converts the episodes of a part."""
+        return self._convert
+
+    def _convert(self, episode: int, table: pa.Table) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
         """Return the new columns of an episode."""
         joints, targets = vectors(table, keys.STATE), vectors(table, keys.ACTION)
         columns = constant_columns(self.cameras, len(table))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.readings import PoseReading
@@ -22,7 +20,7 @@ from lerobot_symview.datasets.conversion import (
     converted_features,
     declared_images,
 )
-from lerobot_symview.datasets.derivation import cut_parts, derived_schema, finish, source_fingerprint, write_part
+from lerobot_symview.datasets.derivation import derived_schema, source_fingerprint, write_dataset
 from lerobot_symview.datasets.features import image_size, names_of
 from lerobot_symview.datasets.hub import HubDataset, push_dataset
 from lerobot_symview.datasets.metadata import CONVERSION
@@ -36,7 +34,7 @@ from lerobot_symview.kinematics import Arm, check_positions
 from lerobot_symview.kinematics.pose import is_singular, tool_poses
 from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
-from lerobot_symview.runtime.staging import is_complete, new_result, partial_folder, plain
+from lerobot_symview.runtime.staging import is_complete, partial_folder, plain
 
 logger = logging.getLogger(__name__)
 
@@ -135,13 +133,8 @@ def _write(config: ConvertActionsConfig) -> Path:
         return target
     with flagged("--robot.units, --robot.signs, --robot.offsets"):
         _check_joints(conversion.arm, source, config)
-    parts, frames = cut_parts(source), source.info["total_frames"]
-    with new_result(target, description, config.resume, "--new_root"):
-        with executor, tqdm(desc="convert", total=frames, unit="frame") as bar:
-            for count in executor.run(partial(write_part, conversion), list(enumerate(parts))):
-                bar.update(count)
-        finish(conversion, parts, description, CONVERSION)
-    logger.info("wrote %d frames with %s to %s", frames, _declaration(conversion), target)
+    write_dataset(conversion, executor, target, "convert", description, CONVERSION, config.resume)
+    logger.info("wrote %d frames with %s to %s", source.info["total_frames"], _declaration(conversion), target)
     return target
 
 

@@ -14,8 +14,9 @@ import hashlib
 import json
 import shutil
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,13 +24,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.image_statistics import ImageStatistics, image_summary
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
-from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of
+from lerobot_symview.runtime.staging import DATASET, disk_errors, new_result, part_of
 
 PART_FRAMES = 200  # least frames of a part, unless its source file has fewer
+
+Derive = Callable[[int, pa.Table], tuple[dict[str, pa.Array], dict[str, ImageStatistics]]]
+"""Takes an episode and its table; returns its new columns, and the statistics of its new images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +62,8 @@ class Derivation(ABC):
         """Columns of the source from which the new ones are made."""
 
     @abstractmethod
-    def derive(self, episode: int, table: pa.Table) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
-        """Return an episode's new columns, and the statistics of its new images."""
+    def deriver(self) -> Derive:
+        """Return what makes the new columns of the episodes of a part."""
 
     @property
     def image_kinds(self) -> dict[str, Literal["rgb", "height"]]:
@@ -132,6 +137,38 @@ def derived_schema(source: SourceDataset, dropped: list[str], added: Features) -
     return TableFeatures(features).arrow_schema
 
 
+def write_dataset(
+    derivation: Derivation,
+    executor: Any,
+    target: Path,
+    label: str,
+    description: dict[str, Any],
+    settings: str,
+    resume: bool,
+) -> None:
+    """Write a derived dataset with a progress bar.
+
+    Args:
+        derivation: what to write.
+        executor: runs the parts, see `runtime.executors`.
+        target: folder of the result.
+        label: of the progress bar.
+        description: all settings that determine the result; they go into its file `settings`.
+        settings: name of that file.
+        resume: whether to continue an interrupted run.
+
+    Raises:
+        CommandError: if the result is there, or an interrupted run that is not to be resumed or had other settings.
+    """
+    source = derivation.open_source()
+    parts = cut_parts(source)
+    with new_result(target, description, resume, "--new_root"):
+        with executor, tqdm(desc=label, total=source.info["total_frames"], unit="frame") as bar:
+            for count in executor.run(partial(write_part, derivation), list(enumerate(parts))):
+                bar.update(count)
+        finish(derivation, parts, description, settings)
+
+
 def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
     """Write the table and statistics of a part unless they exist; return its number of frames."""
     index, episodes = part
@@ -142,6 +179,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
         return count
     merged = derivation.no_statistics()
     summaries: dict[str, list[NDArray]] = {key: [] for key in merged}
+    derive = derivation.deriver()
     kept = [name for name in derivation.schema.names if name not in derivation.added]
     columns = list(dict.fromkeys([*kept, *derivation.columns]))
     tables = EpisodeTables(source, source.data_file(episodes.start), columns)
@@ -152,7 +190,7 @@ def write_part(derivation: Derivation, part: tuple[int, range]) -> int:
             with pq.ParquetWriter(table_part, derivation.schema) as writer:
                 for episode in episodes:
                     table = tables.read(episode)
-                    new, statistics = derivation.derive(episode, table)
+                    new, statistics = derive(episode, table)
                     arrays = [table[name] if name in kept else new[name] for name in derivation.schema.names]
                     # one row group per episode, as LeRobot writes them
                     writer.write_table(pa.table(arrays, schema=derivation.schema), row_group_size=len(table))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ import pyarrow as pa
 
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import Calibration
-from lerobot_symview.datasets.derivation import Derivation
+from lerobot_symview.datasets.derivation import Derivation, Derive
 from lerobot_symview.datasets.features import calibration_vectors
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.image_codec import encode_metres, encode_rgb
@@ -60,9 +61,15 @@ class ViewDerivation(Derivation):
             for output, kind in view.outputs.items()
         }
 
-    def derive(self, episode: int, table: pa.Table) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
+    def deriver(self) -> Derive:
+        """Return what renders the episodes of a part, with one reader."""
+        return partial(self._render, self.reader)
+
+    def _render(
+        self, reader: FrameReader, episode: int, table: pa.Table
+    ) -> tuple[dict[str, pa.Array], dict[str, ImageStatistics]]:
         """Render an episode; return its new columns and the statistics of its new images."""
-        reader, kinds, statistics = self.reader, self.image_kinds, self.no_statistics()
+        kinds, statistics = self.image_kinds, self.no_statistics()
         encoded: dict[str, list[bytes]] = {key: [] for key in kinds}
         renderers = [view.start_episode() for view in self.views.values()]
         for frame in reader.frames(episode, table):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ ANGLE_WEIGHT = 0.1  # metres that count as much as a radian
 EXACT = 1e-7  # metres, and radians times their weight, of a solution that needs no further iteration
 STALLED = 1e-6  # relative decrease of the error at which it is at its least
 DIFFERENCE = 1e-6  # of a joint, for derivatives
+Unreachable = Literal["hold", "error"]
+UNREACHABLE: tuple[Unreachable, ...] = ("hold", "error")  # what a robot may do where no solution is near enough
 LONGEST = 0.3  # radians or metres of a joint per iteration
 
 

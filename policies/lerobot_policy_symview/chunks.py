@@ -108,7 +108,7 @@ class ChunkPolicy(SymviewPolicy):
         """
         if self.training and self.config.aperture_noise:
             batch = batch | {keys.STATE: self._noisy(batch[keys.STATE])}
-        state, actions, is_pad = self._present_state(batch), batch[keys.ACTION], batch.get(f"{keys.ACTION}_is_pad")
+        state, actions, is_pad = latest(batch)[keys.STATE], batch[keys.ACTION], batch.get(f"{keys.ACTION}_is_pad")
         actions = actions if actions.ndim == 3 else actions[:, None]
         transform, crop_offset = None, None
         if self.training:
@@ -140,8 +140,9 @@ class ChunkPolicy(SymviewPolicy):
             CalibrationError: as `select_action`.
         """
         self.eval()
-        state = self._present_state(batch)
-        self.check_first_image(latest(batch))
+        present = latest(batch)
+        state = present[keys.STATE]
+        self.check_first_image(present)
         noise = self.draw_noise(state.shape[0]) if noise is None else noise
         network = self.averaged or self.network
         with self.precision():
@@ -197,13 +198,7 @@ class ChunkPolicy(SymviewPolicy):
 
     def _frames(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return T B frames; a history that is too short repeats its first observation."""
-        count = self.history_length
-        length = history_length(batch)
-        if length is None and count == 1:
+        count, has_time = self.history_length, history_length(batch) is not None
+        if count == 1 and not has_time:
             return batch
-        return as_frames(with_length(batch if length else stacked([batch]), count))
-
-    def _present_state(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return the latest states (B, N) of the samples."""
-        state = batch[keys.STATE]
-        return state if state.ndim == 2 else state[:, -1]
+        return as_frames(with_length(batch if has_time else stacked([batch]), count))

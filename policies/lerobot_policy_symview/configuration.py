@@ -23,6 +23,7 @@ from lerobot_symview.geometry.gripper_state import gripper_columns, missing_of
 from lerobot_symview.geometry.state_reader import ORIGINS, StateOrigin, StateReader, origin_of
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.kinematics import arm_from_plain
+from lerobot_symview.kinematics.inverse import UNREACHABLE, Unreachable
 from lerobot_symview.registry import check_name, lookup
 from lerobot_symview.runtime import view_flags  # noqa: F401  lets draccus read and write ViewSpec
 from lerobot_symview.runtime.cli import flagged
@@ -41,7 +42,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "dtype": ("float32", "bfloat16"),
     "learning_rate_decay": ("none", "cosine"),
     "state_origin": ("None", *ORIGINS),
-    "unreachable": ("hold", "error"),
+    "unreachable": UNREACHABLE,
 }
 UNUSED_OUTPUTS = {"reproj": {"mask": False, "age": False}, "persp": {"gripper": False}}
 
@@ -129,7 +130,7 @@ class SymviewConfig(PreTrainedConfig):
     """Degrees by which one action may send a joint away from where it is, with `arm`; a longer way is shortened."""
     max_arm_error: float = 0.01
     """Metres by which the joints may miss what an action asks for, with `arm`; a radian counts as 0.1 m."""
-    unreachable: Literal["hold", "error"] = "hold"
+    unreachable: Unreachable = "hold"
     """What to do where they would miss it by more: `hold` the arm, or stop with an `error`."""
 
     check_camera: bool = False

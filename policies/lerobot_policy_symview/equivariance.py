@@ -90,8 +90,8 @@ def equivariance_errors(
         history = policy.history_length
         raw = example_observation(config, policy.action_center.dtype, batch=EXAMPLES * history)
     else:
-        history = history_length(observation) or 1
-        raw = as_frames(observation) if history_length(observation) else observation
+        length = history_length(observation)
+        history, raw = (1, observation) if length is None else (length, as_frames(observation))
     group = checked_group(config)
     training = policy.training
     noise = policy.draw_noise(len(raw[keys.STATE]) // history, torch.Generator().manual_seed(0))

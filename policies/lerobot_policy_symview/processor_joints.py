@@ -9,27 +9,26 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.configs.types import PipelineFeatureType, PolicyFeature
-from lerobot.lerobot_types import PolicyAction, RobotObservation, TransitionKey
+from lerobot.lerobot_types import PolicyAction, RobotObservation
 from lerobot.processor import ObservationProcessorStep, PolicyActionProcessorStep, ProcessorStepRegistry
 
+from lerobot_policy_symview.processor_views import is_training
 from lerobot_symview import keys
 from lerobot_symview.errors import KinematicsError
 from lerobot_symview.kinematics import Arm, arm_from_plain, solve
 from lerobot_symview.kinematics.arm import APERTURE, INCREMENT, pose_after
-from lerobot_symview.kinematics.inverse import ANGLE_WEIGHT
+from lerobot_symview.kinematics.inverse import ANGLE_WEIGHT, UNREACHABLE, Unreachable
 from lerobot_symview.kinematics.model import Array
 from lerobot_symview.kinematics.pose import is_singular, tool_poses
 from lerobot_symview.kinematics.units import check_present
 
 logger = logging.getLogger(__name__)
 
-Unreachable = Literal["hold", "error"]
-UNREACHABLE: tuple[Unreachable, ...] = ("hold", "error")
 _PRESENT: dict[str, Array] = {}
 """Arm -> the joint positions (B, J) that its robot had last."""
 
@@ -57,9 +56,7 @@ class JointsProcessorStep(ObservationProcessorStep):
         Raises:
             KinematicsError: if the state has another number of dimensions, or positions that the arm cannot have.
         """
-        transition = getattr(self, "_current_transition", None)
-        is_training = transition is not None and transition.get(TransitionKey.ACTION) is not None
-        if self._arm is None or is_training or keys.STATE not in observation:
+        if self._arm is None or is_training(self) or keys.STATE not in observation:
             return observation
         state, names = observation[keys.STATE], self._arm.state_names
         if state.ndim != 2 or state.shape[-1] != len(names):

@@ -121,7 +121,7 @@ class ViewsProcessorStep(ObservationProcessorStep):
     def _with_views(self, observation: RobotObservation, history: int = 1) -> RobotObservation:
         """Return frames (T B, ...) with depth in metres and views; T, the `history`, are of the same camera."""
         observation = self._depth.in_metres(self._own_names(observation))
-        is_augmented = self.augmentation > 0 and self._is_training
+        is_augmented = self.augmentation > 0 and is_training(self)
         if is_augmented:
             observation = {key: values for key, values in observation.items() if key not in self._made}
         missing = {
@@ -139,18 +139,12 @@ class ViewsProcessorStep(ObservationProcessorStep):
         batches = self._batches(observation, missing)
         for name, view in missing.items():
             rendered = self._rendered(name, view, self._merged(view, batches))
-            if not self._is_training:
+            if not is_training(self):
                 self._report_black(name, rendered[next(iter(view.outputs))])
             for output, images in rendered.items():
                 made = images.float() / 255 if images.dtype == torch.uint8 else images[:, None]
                 observation.setdefault(keys.view(self.camera, output), made)
         return observation
-
-    @property
-    def _is_training(self) -> bool:
-        """Whether the observations have actions, as those of a dataset do."""
-        transition = getattr(self, "_current_transition", None)
-        return transition is not None and transition.get(TransitionKey.ACTION) is not None
 
     def reset(self) -> None:
         """Start an episode: views with memory forget the frames of the last one."""
@@ -291,6 +285,12 @@ class ViewsProcessorStep(ObservationProcessorStep):
             output: image.permute(0, 3, 1, 2) if image.ndim == 4 else image for output, image in stacked.items()
         }
         return {output: image.to(device) for output, image in channels_first.items()}
+
+
+def is_training(step: ObservationProcessorStep) -> bool:
+    """Whether a step's observations have actions, as those of a dataset do."""
+    transition = getattr(step, "_current_transition", None)
+    return transition is not None and transition.get(TransitionKey.ACTION) is not None
 
 
 def start_episodes() -> None:

@@ -1,13 +1,16 @@
 """Configurations of `add_views`, contents of folders, and recorded and modified datasets."""
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_symview import keys
+from lerobot_symview.datasets import derivation
 from lerobot_symview.datasets.add_views import AddViewsConfig
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.datasets.image_codec import decode_depth, encode_metres
@@ -21,6 +24,23 @@ def views_config(source, target, **options):
 
 def contents(folder):
     return {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@contextmanager
+def interrupted_at_the_second_part(monkeypatch):
+    """Expect that a derived dataset is written, which ends as by Ctrl-C once one part is there."""
+    written, write_part = [], derivation.write_part
+
+    def fail_at_the_second(config, part):
+        if written:
+            raise KeyboardInterrupt
+        written.append(part)
+        return write_part(config, part)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(derivation, "write_part", fail_at_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            yield
 
 
 def images_of(folder, key):

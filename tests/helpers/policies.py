@@ -46,9 +46,11 @@ def training_batch(config: SymviewConfig, batch: int = 4) -> dict[str, torch.Ten
     return example_observation(config, batch=batch) | {keys.ACTION: 0.1 * actions}
 
 
-def take_training_steps(policy: SymviewPolicy, count: int = 3, rate: float = 1e-3) -> list[float]:
+def take_training_steps(
+    policy: SymviewPolicy, count: int = 3, rate: float = 1e-3, batch: dict[str, torch.Tensor] | None = None
+) -> list[float]:
     policy.train()
-    batch = training_batch(policy.config)
+    batch = training_batch(policy.config) if batch is None else batch
     optimizer = torch.optim.Adam(policy.get_optim_params(), lr=rate)
     losses = []
     for _ in range(count):

@@ -12,6 +12,7 @@ from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
 from lerobot_policy_symview.equivariance import assert_equivariant, equivariance_errors, example_observation
 from lerobot_policy_symview.export import export_policy
 from lerobot_policy_symview.inputs.history import as_history, latest, stacked
+from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.modeling_symview_flow import SymviewFlowPolicy
@@ -21,9 +22,10 @@ from lerobot_policy_symview.rl.rollouts import Actor
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
 from lerobot_symview import keys
-from tests.helpers.policies import STATS, make_config
+from tests.helpers.policies import STATS, make_config, take_training_steps
 from tests.helpers.training import train as lerobot_train
 
+EQUIVARIANT = [method for method in METHODS if not method.endswith(("_broken", "_relaxed", "_nonequi", "_plucker"))]
 POSE = ["x", "y", "z", "yaw", "aperture"]
 HORIZON, CHUNK = 6, {"n_obs_steps": 2, "horizon": 6, "n_action_steps": 3, "denoiser_width": 64}
 POLICIES = {"flow": (SymviewFlowPolicy, SymviewFlowConfig), "regression": (SymviewBcPolicy, SymviewBcConfig)}
@@ -45,24 +47,17 @@ def chunk_batch(config, samples=3):
     return history | {keys.ACTION: actions, "action_is_pad": is_pad}
 
 
-def train(policy, batch, steps=3):
-    policy.train()
-    optimizer = torch.optim.Adam(policy.get_optim_params(), lr=3e-3)
-    for _ in range(steps):
-        loss, _ = policy.forward(dict(batch))
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        policy.update()
+def train(policy, steps=3):
+    take_training_steps(policy, steps, rate=3e-3, batch=chunk_batch(policy.config))
     return policy
 
 
 @pytest.mark.parametrize("kind", POLICIES)
-@pytest.mark.parametrize("method", ["reproj_equi", "persp_equi", "sideview_equi"])
+@pytest.mark.parametrize("method", [pytest.param(method, marks=pytest.mark.long) for method in EQUIVARIANT])
 def test_chunks_are_equivariant_before_and_after_training_and_loading(kind, method, tmp_path):
     policy = make_chunk_policy(kind, method=method)
     assert_equivariant(policy)
-    train(policy, chunk_batch(policy.config))
+    train(policy)
     assert_equivariant(policy)
     policy.save_pretrained(tmp_path)
     loaded = type(policy).from_pretrained(tmp_path)
@@ -73,14 +68,23 @@ def test_chunks_are_equivariant_before_and_after_training_and_loading(kind, meth
 @pytest.mark.parametrize("options", [{"group": "C4"}, {"action_mode": "absolute"}])
 def test_other_groups_and_absolute_actions_are_equivariant(options):
     policy = make_chunk_policy(**options)
-    train(policy, chunk_batch(policy.config))
+    train(policy)
     assert_equivariant(policy)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("method", [method for method in METHODS if method not in EQUIVARIANT])
+def test_the_other_methods_train_and_act(method):
+    policy = train(make_chunk_policy(method=method))
+    chunk = policy.predict_action_chunk(example_observation(policy.config))
+    assert chunk.shape == (2, HORIZON, 5)
+    assert chunk.isfinite().all()
 
 
 @pytest.mark.parametrize("options", [{"method": "sideview_nonequi"}, {"encoder": "plain"}])
 def test_plain_networks_are_not_equivariant(options):
     policy = make_chunk_policy(**options)
-    train(policy, chunk_batch(policy.config), steps=30)
+    train(policy, steps=30)
     assert min(equivariance_errors(policy).values()) > 0.05
     with pytest.raises(AssertionError, match="not equivariant"):
         assert_equivariant(policy)
@@ -88,7 +92,7 @@ def test_plain_networks_are_not_equivariant(options):
 
 def test_samples_differ_in_their_noise_alone():
     policy = make_chunk_policy()
-    train(policy, chunk_batch(policy.config))
+    train(policy)
     observation = example_observation(policy.config)
     noise = policy.draw_noise(2, torch.Generator().manual_seed(5))
     same = [policy.predict_action_chunk(observation, noise=noise) for _ in range(2)]
@@ -152,7 +156,7 @@ def test_the_loss_has_the_size_of_the_noise_at_initialisation():
 
 def test_select_action_carries_out_a_chunk_and_then_predicts_the_next():
     policy = make_chunk_policy()
-    train(policy, chunk_batch(policy.config))
+    train(policy)
     frames = [example_observation(policy.config, batch=4) for _ in range(8)]
     for index, frame in enumerate(frames):
         frame[keys.STATE] = frame[keys.STATE] + 0.001 * index
@@ -181,7 +185,7 @@ def test_the_views_of_a_history_are_those_of_its_frames():
 
 def test_more_integration_steps_approach_the_exact_flow():
     policy = make_chunk_policy()
-    train(policy, chunk_batch(policy.config), steps=30)
+    train(policy, steps=30)
     observation, noise = example_observation(policy.config), policy.draw_noise(2)
     chunks = {}
     for steps in (1, 8, 64):
@@ -243,7 +247,7 @@ def test_a_policy_that_checks_the_camera_compares_the_present_image(monkeypatch)
 
 def test_sampling_in_bfloat16_is_near_that_in_float32():
     policy = make_chunk_policy()
-    train(policy, chunk_batch(policy.config))
+    train(policy)
     observation, noise = example_observation(policy.config), policy.draw_noise(2)
     exact = policy.predict_action_chunk(observation, noise=noise)
     policy.config.dtype = "bfloat16"

@@ -22,7 +22,7 @@ def history_length(batch: Mapping[str, Any]) -> int | None:
 def as_frames(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return a batch with observations (B, T, ...) as one with frames (T B, ...), all samples of a time together."""
     return {
-        name: values.transpose(0, 1).flatten(0, 1) if _has_time(name, values) else values
+        name: values.transpose(0, 1).flatten(0, 1) if _is_observed(name, values, axes=2) else values
         for name, values in batch.items()
     }
 
@@ -31,7 +31,7 @@ def as_history(frames: Mapping[str, Any], length: int) -> dict[str, Any]:
     """Return frames (T B, ...) as observations (B, T, ...): the inverse of `as_frames`."""
     return {
         name: values.view(length, -1, *values.shape[1:]).transpose(0, 1)
-        if name.startswith(OBSERVATION) and isinstance(values, Tensor) and values.ndim
+        if _is_observed(name, values, axes=1)
         else values
         for name, values in frames.items()
     }
@@ -42,10 +42,7 @@ def stacked(observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         name: torch.stack([observation[name] for observation in observations], dim=1)
         for name, values in observations[-1].items()
-        if name.startswith(OBSERVATION)
-        and isinstance(values, Tensor)
-        and values.ndim
-        and all(name in observation for observation in observations)
+        if _is_observed(name, values, axes=1) and all(name in observation for observation in observations)
     }
 
 
@@ -53,7 +50,7 @@ def latest(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return the present observations (B, ...) of a batch, with a history or without."""
     if history_length(batch) is None:
         return dict(batch)
-    return {name: values[:, -1] if _has_time(name, values) else values for name, values in batch.items()}
+    return {name: values[:, -1] if _is_observed(name, values, axes=2) else values for name, values in batch.items()}
 
 
 def with_length(batch: Mapping[str, Any], length: int) -> dict[str, Any]:
@@ -66,8 +63,11 @@ def with_length(batch: Mapping[str, Any], length: int) -> dict[str, Any]:
     if not count:
         raise ValueError("the history has no observation")
     indices = [max(0, index) for index in range(count - length, count)]
-    return {name: values[:, indices] if _has_time(name, values) else values for name, values in batch.items()}
+    return {
+        name: values[:, indices] if _is_observed(name, values, axes=2) else values for name, values in batch.items()
+    }
 
 
-def _has_time(name: str, values: Any) -> bool:
-    return name.startswith(OBSERVATION) and isinstance(values, Tensor) and values.ndim >= 2
+def _is_observed(name: str, values: Any, axes: int) -> bool:
+    """Whether a batch's entry is an observation of every sample: (B, ...), or with two axes (B, T, ...)."""
+    return name.startswith(OBSERVATION) and isinstance(values, Tensor) and values.ndim >= axes

@@ -24,7 +24,7 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.kinematics import arm_from_plain
 from lerobot_symview.runtime.cli import CommandError
 from tests.helpers.arms import CAMERAS, JOINTS, NAMES, SO101, SO101_MJCF, arm_recording, mujoco_places, record_arm, yaws
-from tests.helpers.datasets import contents
+from tests.helpers.datasets import contents, interrupted_at_the_second_part
 
 FRAMES, EPISODES = 40, 2
 
@@ -179,18 +179,9 @@ def test_videos_are_copied(cameras_file, tmp_path):
 def test_an_interrupted_run_is_resumed_and_workers_change_nothing(recorded_arm, cameras_file, tmp_path, monkeypatch):
     monkeypatch.setattr(derivation, "PART_FRAMES", 1)
     reference = contents(convert_actions(config_of(recorded_arm, tmp_path / "reference", cameras_file)))
-    target, written = tmp_path / "derived", []
-
-    def fail_at_the_second(conversion, part):
-        if written:
-            raise KeyboardInterrupt
-        written.append(part)
-        return derivation.write_part(conversion, part)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("lerobot_symview.datasets.convert_actions.write_part", fail_at_the_second)
-        with pytest.raises(KeyboardInterrupt):
-            convert_actions(config_of(recorded_arm, target, cameras_file))
+    target = tmp_path / "derived"
+    with interrupted_at_the_second_part(monkeypatch):
+        convert_actions(config_of(recorded_arm, target, cameras_file))
     assert not target.exists()
     with pytest.raises(CommandError, match="is from an interrupted run: add --resume=true"):
         convert_actions(config_of(recorded_arm, target, cameras_file))

@@ -20,7 +20,7 @@ from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.runtime.cli import CommandError
 from tests.conftest import VIEW_SIZE
-from tests.helpers.datasets import contents, views_config
+from tests.helpers.datasets import contents, interrupted_at_the_second_part, views_config
 from tests.helpers.files import largest_file
 
 pytestmark = pytest.mark.long
@@ -58,18 +58,9 @@ def test_parts_are_cut_at_episodes_within_files(recorded, small_parts):
 
 
 def test_an_interrupted_run_is_resumed(recorded, reference, tmp_path, monkeypatch):
-    target, written = tmp_path / "derived", []
-
-    def fail_at_the_second(config, part):
-        if written:
-            raise KeyboardInterrupt
-        written.append(part)
-        return derivation.write_part(config, part)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("lerobot_symview.datasets.add_views.write_part", fail_at_the_second)
-        with pytest.raises(KeyboardInterrupt):
-            add_views(views_config(recorded, target))
+    target = tmp_path / "derived"
+    with interrupted_at_the_second_part(monkeypatch):
+        add_views(views_config(recorded, target))
     assert not target.exists()
     with pytest.raises(CommandError, match="is from an interrupted run: add --resume=true"):
         add_views(views_config(recorded, target))

@@ -81,7 +81,7 @@ class FlowHead(nn.Module):
         super().__init__()
         matrices = torch.tensor(representation, dtype=torch.get_default_dtype())
         self.register_buffer("representation", matrices, persistent=False)
-        self.horizon, self.has_noise = horizon, has_noise
+        self.has_noise = has_noise
         self.denoiser = Denoiser(fields, horizon * matrices.shape[-1], width)
 
     def loss(self, features: Tensor, chunk: Tensor, is_pad: Tensor | None = None) -> Tensor:
@@ -98,7 +98,7 @@ class FlowHead(nn.Module):
         shape = (*target.shape[:2], 1, 1)
         time = torch.rand(shape, device=chunk.device, dtype=chunk.dtype) if self.has_noise else target.new_zeros(shape)
         times = self.denoiser.time_condition(time[..., 0])
-        velocity = self._velocity(torch.lerp(noise, target, time), self._condition(features), times)
+        velocity = self._velocity(torch.lerp(noise, target, time), self.denoiser.condition(features), times)
         errors = (velocity - (target - noise)).square().mean(dim=(0, 3))
         if is_pad is None:
             return errors.mean(dim=1)
@@ -111,18 +111,14 @@ class FlowHead(nn.Module):
         Args:
             features: (B, G, F).
             noise: (B, H, A), standard normal; zeros where chunks have no noise.
-            steps: of the integration.
+            steps: of the integration; without noise, 1 is exact.
         """
-        condition = self._condition(features)
+        condition = self.denoiser.condition(features)
         times = self.denoiser.time_condition(torch.arange(steps, device=noise.device, dtype=noise.dtype) / steps)
         chunk = noise
         for time in times:
             chunk = chunk + self._velocity(chunk, condition, time) / steps
         return chunk
-
-    def _condition(self, features: Tensor) -> Tensor:
-        condition: Tensor = self.denoiser.condition(features)
-        return condition
 
     def _velocity(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
         """Return velocities (..., B, H, A) of noisy chunks (..., B, H, A).
