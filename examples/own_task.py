@@ -56,7 +56,5 @@ if __name__ == "__main__":
     parser.add_argument("--episodes", type=int, default=20)
     args = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    attempts = [
-        demonstrate(EnvSettings("centring"), 0, episode, noise=0.1).attempts for episode in range(args.episodes)
-    ]
+    attempts = [demonstrate(EnvSettings("centring"), 0, i, noise=0.1).attempts for i in range(args.episodes)]
     logging.getLogger(__name__).info("%d demonstrations in %d attempts", args.episodes, sum(attempts))

@@ -154,5 +154,5 @@ def test_preview_writes_an_image_a_page_and_a_rerun_recording(recorded, tmp_path
     assert "wrote " in result.stderr
     with Image.open(tmp_path / "preview.png") as image:
         assert image.size[0] > 1000
-    assert (tmp_path / "preview.html").read_text().count("data:image/png;base64,") == 4 * 7
+    assert (tmp_path / "preview.html").read_text().count("data:image/png;base64,") == 4 * 8
     assert (tmp_path / "preview.rrd").stat().st_size > 100_000

@@ -8,6 +8,7 @@ import numpy as np
 
 from lerobot_symview.geometry.camera import Array
 
+OPEN, CLOSED = 1.0, 0.0  # apertures
 LOOK_AHEAD = 0.3  # seconds
 
 

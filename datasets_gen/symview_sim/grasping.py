@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array
+from symview_sim.control import CLOSED, OPEN
 from symview_sim.motions import motion_to, yaw_difference
 from symview_sim.scene import Scene
 
-OPEN, CLOSED = 1.0, 0.0
 CLEARANCE = 0.1  # metres above an object at which the gripper travels
 LAST_ACTION = 0.05  # metres: the last action of a straight path to an object; a shorter one would begin beside it
 LIFT = np.array([0.0, 0.0, CLEARANCE, 0.0])

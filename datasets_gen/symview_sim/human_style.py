@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array
-from symview_sim.control import Control
-from symview_sim.grasping import CLOSED, OPEN
+from symview_sim.control import CLOSED, OPEN, Control
 
 WRONG_PLACE, EARLY_CLOSE = "wrong_place", "early_close"
 MISTAKE_PROBABILITY = 0.3

@@ -73,17 +73,16 @@ def test_processes_and_interruptions_change_nothing(recorded, remembered, tmp_pa
     options = {"views": [VIEW], "size": None, "new_repo_id": "test/derived"}
     parallel = add_views(views_config(recorded, tmp_path / "parallel", num_workers=2, **options))
     monkeypatch.setattr(derivation, "PART_FRAMES", 1)  # a part for each episode
-    finish = derivation.finish
 
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lerobot_symview.datasets.add_views.finish", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        add_views(views_config(recorded, tmp_path / "resumed", **options))
+    with monkeypatch.context() as patched:
+        patched.setattr(derivation, "finish", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            add_views(views_config(recorded, tmp_path / "resumed", **options))
     tables = sorted((tmp_path / "resumed.partial").rglob("file-*.parquet"))
     tables[1].unlink()
-    monkeypatch.setattr("lerobot_symview.datasets.add_views.finish", finish)
     resumed = add_views(views_config(recorded, tmp_path / "resumed", resume=True, **options))
     for key in OUTPUTS:
         np.testing.assert_array_equal(images_of(resumed, key), images_of(remembered, key))

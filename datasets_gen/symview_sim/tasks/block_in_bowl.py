@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array
-from symview_sim.grasping import LIFT, OPEN, carry, grasp
+from symview_sim.control import OPEN
+from symview_sim.grasping import LIFT, carry, grasp
 from symview_sim.placing import random_places
 from symview_sim.scene import Scene
 from symview_sim.shapes import bowl_parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lerobot_symview.geometry.camera import Array
-from symview_sim.grasping import CLOSED
+from symview_sim.control import CLOSED
 from symview_sim.motions import sweep
 from symview_sim.scene import Scene
 from symview_sim.shapes import HANDLE_REACH, cabinet_parts, drawer_parts
