@@ -31,7 +31,7 @@ class SymviewFlowPolicy(ChunkPolicy):
         super().__init__(config, partial(FlowHead, horizon=config.horizon, width=config.denoiser_width), dataset_stats)
 
     def errors(self, features: Tensor, chunk: Tensor, is_pad: Tensor | None) -> Tensor:
-        """Return the mean squared errors (B,) of velocities."""
+        """Return the mean squared errors (B,) of predicted chunks."""
         errors: Tensor = self.network.head.loss(features, chunk, is_pad)
         return errors
 

@@ -18,6 +18,8 @@ STATS = {
     keys.ACTION: {
         "min": torch.tensor([-0.05, -0.03, -0.05, -0.6, 0.0]),
         "max": torch.tensor([0.04, 0.05, 0.05, 0.7, 1.0]),
+        "mean": torch.tensor([0.0, 0.01, 0.0, 0.1, 0.5]),
+        "std": torch.tensor([0.02, 0.02, 0.03, 0.3, 0.5]),
     }
 }
 

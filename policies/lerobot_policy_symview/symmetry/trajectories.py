@@ -98,12 +98,12 @@ class Trajectories:
     def scale(self, action: Mapping[str, Any], state: Mapping[str, Any] | None, horizon: int) -> tuple[Tensor, Tensor]:
         """Return centre and half-width of the trajectories, by which scaling is equivariant.
 
-        A single increment is scaled by its range. In a longer chunk, the displacement after k increments is at most k
-        times the largest one, and at most the range of the states, if increments have the state's unit. That of a
-        target is at most its distance from any state. A dimension without extent gets width 1.
+        A single increment is scaled by its range. In a longer chunk, the displacement after k increments is scaled by
+        k times their root mean square, the size that it has if the gripper goes on as it started. That of a target is
+        at most its distance from any state. A dimension without extent gets width 1.
 
         Args:
-            action: `min` and `max` (A,) of the actions in the dataset.
+            action: `min` and `max` (A,) of the actions in the dataset; for chunks of increments also `mean` and `std`.
             state: `min` and `max` (N,) of the states, where they are known.
             horizon: H.
 
@@ -114,17 +114,15 @@ class Trajectories:
         center, width = self.actions.scale(low, high)
         if horizon == 1 and self.mode == "delta":
             return center, width
-        first, last = self._state_range(state, low, high)
         if self.mode == "absolute":
+            first, last = self._state_range(state, low, high)
             reach = self._shared(torch.maximum((high - first).abs(), (last - low).abs()))
             yaws = self.actions.of_type("yaw")
             reach[yaws] = reach[yaws].clamp(max=math.pi)
             moving = reach.expand(horizon, -1)
         else:
-            largest = self._shared(torch.maximum(low.abs(), high.abs()))
-            reach = self._shared(last - first)
-            reach = torch.where(reach < largest, math.inf, reach)  # another unit, or unknown
-            moving = torch.minimum(torch.arange(1, horizon + 1)[:, None] * largest, reach)
+            mean, deviation = (torch.as_tensor(action[name], dtype=torch.float32) for name in ("mean", "std"))
+            moving = torch.arange(1, horizon + 1)[:, None] * self._shared(torch.hypot(mean, deviation))
         moving = torch.where(moving > SMALLEST_EXTENT, moving, 1.0)
         center, width = center.repeat(horizon, 1), width.repeat(horizon, 1)
         center[:, self.moving], width[:, self.moving] = 0.0, moving[:, self.moving]
@@ -133,8 +131,6 @@ class Trajectories:
     def _state_range(self, state: Mapping[str, Any] | None, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
         """Return the ends (A,) of the state's range in the moving dimensions; where it is unknown, those given."""
         first, last = low.clone(), high.clone()
-        if self.mode == "delta":
-            first, last = torch.zeros_like(low), torch.zeros_like(high)
         for index in self.moving:
             label = self.actions.dimensions[index]
             if state is not None and label in self.states.dimensions:

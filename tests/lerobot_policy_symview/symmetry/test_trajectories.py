@@ -63,28 +63,34 @@ def test_a_transformed_scene_has_the_transformed_trajectory(mode, element):
     torch.testing.assert_close(trajectories.relative(moved, moved_state), expected)
 
 
-def test_scales_grow_with_time_up_to_the_range_of_the_states():
-    action = {"min": torch.tensor([-0.01, -0.02, -0.01, 0.0, 0.0]), "max": torch.tensor([0.01, 0.01, 0.02, 0.3, 1.0])}
-    state = {"min": torch.tensor([-0.1, 0.0, 0.0, 0.0, 0.0]), "max": torch.tensor([0.1, 0.05, 0.03, 0.0, 1.0])}
-    center, width = Trajectories(POSE, POSE).scale(action, state, horizon=16)
+def test_scales_grow_with_time():
+    """That of a vector is the larger one of its two dimensions, and no dimension that moves has a centre."""
+    action = {
+        "min": torch.tensor([-0.01, -0.02, -0.01, 0.0, 0.0]),
+        "max": torch.tensor([0.01, 0.01, 0.02, 0.3, 1.0]),
+        "mean": torch.tensor([0.003, 0.0, 0.0, 0.05, 0.5]),
+        "std": torch.tensor([0.004, 0.002, 0.01, 0.12, 0.5]),
+    }
+    center, width = Trajectories(POSE, POSE).scale(action, None, horizon=16)
     assert width.shape == center.shape == (16, 5)
-    torch.testing.assert_close(width[0], torch.tensor([0.02, 0.02, 0.02, 0.3, 0.5]))
-    torch.testing.assert_close(width[-1], torch.tensor([0.2, 0.2, 0.03, 4.8, 0.5]))
+    torch.testing.assert_close(width[0], torch.tensor([0.005, 0.005, 0.01, 0.13, 0.5]))
+    torch.testing.assert_close(width[-1], torch.tensor([0.08, 0.08, 0.16, 2.08, 0.5]))
     torch.testing.assert_close(center[3], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
 
 
-def test_increments_in_another_unit_are_not_limited_by_the_state():
-    """Meta-World's commands lie in [-1, 1] and are centimetres, its state is in metres."""
-    ends = {"min": -torch.ones(5), "max": torch.ones(5)}
-    state = {"min": torch.zeros(5), "max": torch.full((5,), 0.3)}
-    _, width = Trajectories(POSE, POSE).scale(ends, state, horizon=16)
-    torch.testing.assert_close(width[-1], torch.tensor([16.0, 16.0, 16.0, 16.0, 1.0]))
+def test_trajectories_of_smooth_motions_have_the_size_of_the_noise():
+    actions = torch.randn(1, 5, dtype=torch.float64) * torch.ones(8, 16, 1, dtype=torch.float64)
+    stats = {"min": -torch.ones(5), "max": torch.ones(5), "mean": actions.mean((0, 1)), "std": actions.std((0, 1))}
+    _, width = Trajectories(POSE, POSE).scale(stats, None, horizon=16)
+    relative = Trajectories(POSE, POSE).relative(actions, torch.zeros(8, 5)) / width
+    assert float(relative[..., 2].square().mean()) == pytest.approx(1, rel=1e-3)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])
 @pytest.mark.parametrize("mode", MODES)
 def test_dimensions_that_never_move_have_width_one(mode, horizon):
     ends = {"min": torch.tensor([-0.1, 0.0, 0.1, 0.0, 0.0]), "max": torch.tensor([0.1, 0.0, 0.1, 0.0, 1.0])}
+    ends |= {"mean": ends["max"] / 2, "std": ends["max"] / 2}
     state = {"min": torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0]), "max": torch.tensor([0.0, 0.0, 0.1, 0.0, 1.0])}
     _, width = Trajectories(POSE, POSE, mode).scale(ends, state, horizon)
     assert width.isfinite().all()

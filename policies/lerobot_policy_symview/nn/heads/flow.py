@@ -3,6 +3,9 @@
 A denoiser with shared weights is applied to every group element g, with the group axis as batch: it gets the noisy
 chunk in the frame of g, which is an equivariant lift to regular fields, and the features of g. Its outputs, brought
 back, are averaged. When the scene and the noise are transformed, so is the result.
+
+The denoiser predicts the chunk at the end of the straight path from the noise, not the velocity: trajectories are
+smooth, so that a small network can represent them, but not the noise (Li and He, 2025).
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ NOISE_SAMPLES = 4  # noisy chunks per observation and step: the denoiser costs l
 
 
 class Denoiser(nn.Module):
-    """Residual network on a flattened chunk, conditioned on features and time; the velocity is zero at initialisation.
+    """Residual network on a flattened chunk, conditioned on features and time; its output is zero at initialisation.
 
     Args:
         fields: F, numbers per group element of the features.
@@ -42,10 +45,10 @@ class Denoiser(nn.Module):
         nn.init.zeros_(self.leave.bias)
 
     def forward(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
-        """Return velocities (..., H A) of noisy chunks (..., H A).
+        """Return the chunks (..., H A) that noisy chunks (..., H A) lead to.
 
         Args:
-            chunk: in the frame of a group element.
+            chunk: noisy, in the frame of a group element.
             condition: (..., BLOCKS width), `condition` of that element's features.
             time: (..., BLOCKS width), `time_condition`.
         """
@@ -53,8 +56,8 @@ class Denoiser(nn.Module):
         conditions = torch.split(condition + time, self.width, dim=-1)
         for norm, widen, narrow, shift in zip(self.norms, self.widen, self.narrow, conditions, strict=True):
             hidden = hidden + narrow(functional.silu(widen(norm(hidden)) + shift))
-        velocity: Tensor = self.leave(functional.silu(hidden))
-        return velocity
+        end: Tensor = self.leave(functional.silu(hidden))
+        return end
 
     def time_condition(self, time: Tensor) -> Tensor:
         """Return the condition (..., BLOCKS width) of times (...) in [0, 1]."""
@@ -85,7 +88,7 @@ class FlowHead(nn.Module):
         self.denoiser = Denoiser(fields, horizon * matrices.shape[-1], width)
 
     def loss(self, features: Tensor, chunk: Tensor, is_pad: Tensor | None = None) -> Tensor:
-        """Return the mean squared errors (B,) of velocities on the straight paths from noise to chunks.
+        """Return the mean squared errors (B,) of the chunks predicted on the straight paths from noise to chunks.
 
         Args:
             features: (B, G, F).
@@ -98,8 +101,8 @@ class FlowHead(nn.Module):
         shape = (*target.shape[:2], 1, 1)
         time = torch.rand(shape, device=chunk.device, dtype=chunk.dtype) if self.has_noise else target.new_zeros(shape)
         times = self.denoiser.time_condition(time[..., 0])
-        velocity = self._velocity(torch.lerp(noise, target, time), self.denoiser.condition(features), times)
-        errors = (velocity - (target - noise)).square().mean(dim=(0, 3))
+        end = self._end(torch.lerp(noise, target, time), self.denoiser.condition(features), times)
+        errors = (end - target).square().mean(dim=(0, 3))
         if is_pad is None:
             return errors.mean(dim=1)
         counted = ~is_pad
@@ -116,12 +119,12 @@ class FlowHead(nn.Module):
         condition = self.denoiser.condition(features)
         times = self.denoiser.time_condition(torch.arange(steps, device=noise.device, dtype=noise.dtype) / steps)
         chunk = noise
-        for time in times:
-            chunk = chunk + self._velocity(chunk, condition, time) / steps
+        for step, time in enumerate(times):
+            chunk = chunk + (self._end(chunk, condition, time) - chunk) / (steps - step)
         return chunk
 
-    def _velocity(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
-        """Return velocities (..., B, H, A) of noisy chunks (..., B, H, A).
+    def _end(self, chunk: Tensor, condition: Tensor, time: Tensor) -> Tensor:
+        """Return the chunks (..., B, H, A) that noisy chunks (..., B, H, A) lead to.
 
         Args:
             chunk: noisy chunks.
@@ -130,7 +133,7 @@ class FlowHead(nn.Module):
         """
         with torch.autocast(chunk.device.type, enabled=False):  # rho(g)^-1 is its transpose
             lifted = torch.einsum("gba,...hb->...gha", self.representation, chunk)
-        velocity = self.denoiser(lifted.flatten(-2), condition, time)
+        end = self.denoiser(lifted.flatten(-2), condition, time)
         with torch.autocast(chunk.device.type, enabled=False):
-            velocity = velocity.to(chunk.dtype).unflatten(-1, chunk.shape[-2:])
-            return torch.einsum("gab,...ghb->...ha", self.representation, velocity) / len(self.representation)
+            end = end.to(chunk.dtype).unflatten(-1, chunk.shape[-2:])
+            return torch.einsum("gab,...ghb->...ha", self.representation, end) / len(self.representation)
