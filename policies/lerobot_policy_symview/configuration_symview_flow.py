@@ -23,6 +23,9 @@ class SymviewFlowConfig(ChunkConfig):
     """Actions of a prediction that are carried out before the next one."""
     integration_steps: int = 8
     """Steps of the integration from noise to a chunk, 1 to 10 or more: fewer are faster and less exact."""
+    noise_scale: float = 0.5
+    """Standard deviation of the noise in evaluation, 1 in training: with less, chunks keep to what most demonstrations
+    do, and repeat fewer of their pauses and mistakes."""
     learning_rate_decay: Literal["none", "cosine"] = "cosine"
     """`cosine` anneals the learning rate to zero; `none` keeps it constant."""
     weight_averaging: float = 0.99
@@ -33,3 +36,5 @@ class SymviewFlowConfig(ChunkConfig):
         super().check()
         if not 1 <= self.integration_steps <= 100:
             raise ValueError(f"--policy.integration_steps must lie between 1 and 100, got {self.integration_steps}")
+        if not 0 <= self.noise_scale <= 1:
+            raise ValueError(f"--policy.noise_scale must lie between 0 and 1, got {self.noise_scale}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from lerobot_policy_symview.chunks import ChunkPolicy
@@ -34,6 +35,10 @@ class SymviewFlowPolicy(ChunkPolicy):
         """Return the mean squared errors (B,) of predicted chunks."""
         errors: Tensor = self.network.head.loss(features, chunk, is_pad)
         return errors
+
+    def draw_noise(self, samples: int, generator: torch.Generator | None = None) -> Tensor:
+        """Return noise (B, H, A) for chunks, of the standard deviation `noise_scale`."""
+        return self.config.noise_scale * super().draw_noise(samples, generator)
 
     def scaled_chunk(self, network: Network, features: Tensor, noise: Tensor) -> Tensor:
         """Return scaled trajectories (B, H, A) that start as noise."""

@@ -65,6 +65,7 @@ WRONG = {
     "symview_flow": {
         "n_obs_steps": (0, "--policy.n_obs_steps must lie between 1 and 8, got 0"),
         "integration_steps": (0, "--policy.integration_steps must lie between 1 and 100, got 0"),
+        "noise_scale": (1.5, "--policy.noise_scale must lie between 0 and 1, got 1.5"),
     },
     "symview_sacfd": {
         "n_obs_steps": (2, "--policy.n_obs_steps must be 1 for symview_sacfd, got 2"),

@@ -192,6 +192,14 @@ def test_more_integration_steps_approach_the_exact_flow():
     assert (chunks[8] - chunks[64]).abs().max() < (chunks[1] - chunks[64]).abs().max()
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.5, 1.0])
+def test_evaluation_draws_less_noise_than_training(scale):
+    policy = make_chunk_policy(noise_scale=scale)
+    whole, drawn = (torch.Generator().manual_seed(1) for _ in range(2))
+    expected = scale * torch.randn(40, HORIZON, len(policy.config.action_symmetry), generator=whole)
+    torch.testing.assert_close(policy.draw_noise(40, drawn), expected)
+
+
 def test_the_model_card_says_what_it_sees_and_predicts():
     card = str(model_card(make_chunk_policy().config, 1000, "me/data", {}))
     assert "It acts on the last 2 observations of one camera and predicts 6 actions." in card
