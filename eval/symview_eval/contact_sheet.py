@@ -48,13 +48,22 @@ def montage(rows: list[SheetRow]) -> Image.Image:
     return sheet
 
 
-def page(title: str, rows: list[SheetRow], warnings: list[str]) -> str:
-    """Return the contact sheet as an HTML page; it embeds the images at their own size and the browser scales them."""
+def page(title: str, rows: list[SheetRow], warnings: list[str], declaration: list[str]) -> str:
+    """Return the contact sheet as an HTML page; it embeds the images at their own size and the browser scales them.
+
+    Args:
+        title: heading.
+        rows: of images.
+        warnings: sentences above them.
+        declaration: sentences on the declared types, below them.
+    """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("symview_eval"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     embedded = [(row, [(name, png_uri(image)) for name, image in row.images.items()]) for row in rows]
-    return environment.get_template("preview.html").render(title=title, rows=embedded, warnings=warnings, tile=TILE)
+    return environment.get_template("preview.html").render(
+        title=title, rows=embedded, warnings=warnings, declaration=declaration, tile=TILE
+    )
 
 
 def with_outline(

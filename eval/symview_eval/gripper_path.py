@@ -82,6 +82,22 @@ class GripperPath:
 
 def read_path(reader: FrameReader, episode: int) -> GripperPath | None:
     """Return the gripper's way in an episode; None if the state does not say where it is."""
+    points = gripper_points(reader, episode)
+    if points is None:
+        return None
+    path = GripperPath(points, reader.workspace)
+    if path.outside > OUTSIDE:
+        logger.warning(
+            "in %.0f %% of episode %d the gripper is not over the workspace: check what the state's positions count "
+            "from, and the base's pose",
+            100 * path.outside,
+            episode,
+        )
+    return path
+
+
+def gripper_points(reader: FrameReader, episode: int) -> NDArray[np.float64] | None:
+    """Return where the gripper is in an episode (N, 3), metres, in the calibration's world; None if it is unknown."""
     try:
         states = reader.state_reader
     except CalibrationError as error:
@@ -95,12 +111,4 @@ def read_path(reader: FrameReader, episode: int) -> GripperPath | None:
     found = states.read(vectors(table, keys.STATE).astype(np.float64))
     points = found[:, [column for column in columns[: len(REQUIRED)] if column is not None]]
     points[:, :2] += reader.workspace.center
-    path = GripperPath(points, reader.workspace)
-    if path.outside > OUTSIDE:
-        logger.warning(
-            "in %.0f %% of episode %d the gripper is not over the workspace: check what the state's positions count "
-            "from, and the base's pose",
-            100 * path.outside,
-            episode,
-        )
-    return path
+    return points

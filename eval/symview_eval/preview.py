@@ -53,7 +53,8 @@ class PreviewConfig:
     """Show frames of a dataset: the camera's image with the workspace and the gripper's path, the views, their masks.
 
     Writes a contact sheet (preview.png, preview.html) and, with rerun, preview.rrd. Warns about a camera that sees too
-    little of the workspace, views with many inferred pixels, and a camera whose resolution is too low for the views.
+    little of the workspace, views with many inferred pixels, a camera whose resolution is too low for the views, and
+    demonstrations that contradict the declared symmetry of states and actions.
     """
 
     dataset: DatasetLocation
@@ -89,6 +90,10 @@ class PreviewConfig:
     """
     state_origin: StateOrigin | None = None
     """What the positions in the state count from: workspace, world or base; as for symview-add-views."""
+    state_symmetry: list[str] | None = None
+    """Types of the state's dimensions, as for --policy.state_symmetry; by default those that its names say."""
+    action_symmetry: list[str] | None = None
+    """Types of the action's dimensions, as for --policy.action_symmetry; by default those that its names say."""
     check: bool = False
     """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
     the camera as it stands in the last of them."""
@@ -206,10 +211,16 @@ def preview(config: PreviewConfig) -> Path:
     if recording is not None:
         recording.close()
     warnings = _warnings(config, views, reader.workspace, measured) if reader is not None else []
+    from symview_eval.declaration import check_declaration  # imports LeRobot, which takes seconds
+
+    declaration = check_declaration(source, reader, config.state_symmetry, config.action_symmetry)
+    warnings += declaration.warnings
     for warning in warnings:
         logger.warning("%s", warning)
     montage(rows).save(config.output_dir / "preview.png")
-    (config.output_dir / "preview.html").write_text(page(config.dataset.repo_id, rows, warnings))
+    (config.output_dir / "preview.html").write_text(page(config.dataset.repo_id, rows, warnings, declaration.facts))
+    for fact in declaration.facts:
+        logger.info("declared symmetry: %s", fact)
     logger.info("wrote %s", ", ".join(str(file) for file in sorted(config.output_dir.glob("preview.*"))))
     if reader is not None:
         if config.check:

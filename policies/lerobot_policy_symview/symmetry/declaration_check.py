@@ -198,8 +198,11 @@ def _consistency(moved: Motion, rows: list[int], group: PlanarGroup, seen: Array
     total = moved.products.sum(axis=0, keepdims=True)
     free, bound = (_fit(bases[index], total, outputs)[0] for index in (0, -1))
     units = moved.scale[outputs, None] / moved.scale[1:width]
-    same = [moved.actions.dimensions.index(moved.states.dimensions[row]) for row in rows if
-            moved.states.dimensions[row] in moved.actions.dimensions]
+    same = [
+        moved.actions.dimensions.index(moved.states.dimensions[row])
+        for row in rows
+        if moved.states.dimensions[row] in moved.actions.dimensions
+    ]
     gain = float((bound[:, 1:] * units)[0, same[0]]) if len(same) == len(rows) else None
     spread = np.sqrt(np.diagonal(total[0])[1:width] / total[0, 0, 0])
     return Consistency(
@@ -238,7 +241,7 @@ def _commuting(of_inputs: Array, of_outputs: Array) -> Array:
 
 
 def _fit(basis: Array, products: Array, outputs: list[int]) -> Array:
-    """Return the least-squares maps (R, O, I) in the span of a basis (K, O, I), of sums of products (R, I + S, I + S)."""
+    """Return the least-squares maps (R, O, I) in the span of a basis (K, O, I), of products (R, I + S, I + S)."""
     width = basis.shape[2]
     of_inputs, mixed = products[:, :width, :width], products[:, outputs, :width]
     normal = np.einsum("kij,rjm,lim->rkl", basis, of_inputs, basis)
