@@ -63,8 +63,6 @@ def check_declaration(
     missing = [key for key in (keys.STATE, keys.ACTION) if key not in source.features]
     if missing:
         report.facts.append(f"not checked: the dataset lacks {', '.join(missing)}")
-    elif len(source.episodes) < LEAST_EPISODES:
-        report.facts.append(f"not checked: {len(source.episodes)} episodes, expected at least {LEAST_EPISODES}")
     elif None in declared:
         report.facts.append(
             "not checked: the names of states and actions are no types; declare them by --state_symmetry and "
@@ -73,8 +71,11 @@ def check_declaration(
     else:
         of_state = VectorRepresentation(tuple(declared[0]), "--state_symmetry")
         of_action = VectorRepresentation(tuple(declared[1]), "--action_symmetry")
-        of_state.check(len(states.read_names), keys.STATE, states.read_names)
+        of_state.check(len(states.read_names) or source.features[keys.STATE]["shape"][0], keys.STATE, states.read_names)
         of_action.check(source.features[keys.ACTION]["shape"][0], keys.ACTION, action_names)
+        if len(source.episodes) < LEAST_EPISODES:
+            report.facts.append(f"not checked: {len(source.episodes)} episodes, expected at least {LEAST_EPISODES}")
+            return report
         _check_numbers(report, source, states, of_state, of_action, group)
     if reader is not None:
         _check_images(report, reader, group)

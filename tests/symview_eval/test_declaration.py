@@ -188,6 +188,14 @@ def test_declared_types_take_the_place_of_names(arm, tmp_path):
         report_of(unnamed, "front", state_types=["y", "x", *right[2:]], action_types=right)
 
 
+def test_a_state_without_names_is_declared(arm, tmp_path):
+    unnamed = changed(arm, tmp_path / "unnamed", permuted(0, 1, 2, 3, 4, 5))
+    change_feature(unnamed, keys.STATE, names=None)
+    report = report_of(unnamed, "front", state_types=[*TYPES, "scalar"])
+    assert report.warnings == []
+    assert report.facts[0].startswith("x, y: the actions explain")
+
+
 def test_too_few_episodes_are_not_checked(recorded):
     assert "not checked: 2 episodes, expected at least 3" in report_of(recorded, "side").facts
 
