@@ -59,18 +59,18 @@ def check_declaration(
     report, group = DeclarationReport(), make_group(GROUP)
     states = _state_reader(source, reader)
     action_names = names_of(source.features, keys.ACTION)
-    declared = (state_types or types_of(states.read_names), action_types or types_of(action_names))
+    state_types, action_types = state_types or types_of(states.read_names), action_types or types_of(action_names)
     missing = [key for key in (keys.STATE, keys.ACTION) if key not in source.features]
     if missing:
         report.facts.append(f"not checked: the dataset lacks {', '.join(missing)}")
-    elif None in declared:
+    elif state_types is None or action_types is None:
         report.facts.append(
             "not checked: the names of states and actions are no types; declare them by --state_symmetry and "
             "--action_symmetry"
         )
     else:
-        of_state = VectorRepresentation(tuple(declared[0]), "--state_symmetry")
-        of_action = VectorRepresentation(tuple(declared[1]), "--action_symmetry")
+        of_state = VectorRepresentation(tuple(state_types), "--state_symmetry")
+        of_action = VectorRepresentation(tuple(action_types), "--action_symmetry")
         of_state.check(len(states.read_names) or source.features[keys.STATE]["shape"][0], keys.STATE, states.read_names)
         of_action.check(source.features[keys.ACTION]["shape"][0], keys.ACTION, action_names)
         if len(source.episodes) < LEAST_EPISODES:
