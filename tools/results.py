@@ -11,8 +11,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from symview_eval.experiments.grid import EXPERIMENTS, Experiment
 from symview_eval.experiments.summary import TableEntry, placement_entries, table_entries
+from symview_eval.experiments.tables import EXPERIMENTS, Experiment
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md", ROOT / "docs" / "cameras.md")

@@ -17,7 +17,6 @@ from typing import cast
 import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.rl.checkpoints import last_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.metrics import read_table
@@ -27,7 +26,8 @@ from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.runtime.staging import part_of
-from symview_eval.experiments.cloning import policy_config, run_cloning
+from symview_eval.experiments.actors import load_actor, save_actor, sight
+from symview_eval.experiments.cloning import run_cloning
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.placements import evaluate_placements
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
@@ -110,7 +110,8 @@ def _attempt(job: CellJob, work: Callable[[CellJob], None]) -> Outcome:
 
 def _record(job: CellJob) -> None:
     cell = job.cell
-    env = world_settings(cell.task, oracle=True, camera=cell.row.camera, more_cameras=cell.row.more_cameras)
+    cameras = {"camera": cell.row.camera, "more_cameras": cell.row.more_cameras}
+    env = world_settings(cell.task, oracle=True, **cameras, **cell.world)
     recorded = cast(RecordedWorld, env)  # the flag `--env.type` needs a class of its own
     generate(
         GenerateConfig(job.demonstrations, recorded, num_episodes=cell.demonstrations, seed=cell.seed, resume=True)
@@ -122,7 +123,7 @@ def _record(job: CellJob) -> None:
                 HubDataset(source.repo_id, source.root),
                 new_repo_id=target.repo_id,
                 new_root=target.root,
-                views=policy_config(cell, "cpu").views_to_make,
+                views=sight(cell, "cpu").views_to_make,
                 resume=True,
             )
         )
@@ -135,7 +136,8 @@ def _run(job: CellJob) -> None:
         oracle=cell.row.policy["method"].startswith("oracle"),
         camera=cell.row.camera,
         more_cameras=cell.row.more_cameras,
-        max_steps=cell.scale.max_steps,
+        max_steps=cell.max_steps,
+        **cell.world,
     )
     times = Times()
     if cell.algorithm == "sacfd":
@@ -144,7 +146,7 @@ def _run(job: CellJob) -> None:
     elif cell.placements:
         if not job.policy.is_dir():
             _train(job, env)
-        checkpoints, times = evaluate_placements(cell, SymviewBcPolicy.from_pretrained(job.policy), env)
+        checkpoints, times = evaluate_placements(cell, load_actor(cell, job.policy, job.device), env)
     else:
         checkpoints, times = _train(job, env)
     origin = Origin(
@@ -162,8 +164,7 @@ def _train(job: CellJob, env: WorldSettings) -> tuple[list[Checkpoint], Times]:
     """Clone the demonstrations and save the policy; return the evaluations during the training and its times."""
     training = run_cloning(job.cell, open_dataset(job.training_data), env, job.device)
     part = part_of(job.policy)
-    for saved in (training.actor.policy, training.actor.preprocessor, training.actor.postprocessor):
-        saved.save_pretrained(part)
+    save_actor(training.actor, part)
     shutil.rmtree(job.policy, ignore_errors=True)
     part.rename(job.policy)
     return training.checkpoints, training.times

@@ -17,11 +17,12 @@ from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.cli import CommandError, run_command, subcommand
 from lerobot_symview.runtime.executors import EXECUTORS
 from lerobot_symview.runtime.locking import RUN_LOCK, locked
-from symview_eval.experiments.grid import EXPERIMENTS, Cell
+from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.queue import ALL, Costs, chosen_cells, distinct, remaining
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import copy_shared, finished_results, unfinished_cells
 from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.tables import EXPERIMENTS
 
 logger = logging.getLogger(__name__)
 

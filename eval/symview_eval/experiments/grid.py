@@ -1,4 +1,4 @@
-"""The paper's tables and figures: methods, tasks and numbers of demonstrations, and the cells they consist of."""
+"""The cells that experiments consist of: one training run each, with its evaluations."""
 
 from __future__ import annotations
 
@@ -11,56 +11,13 @@ from typing import Any
 
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
-from symview_eval.experiments.rows import (
-    ABLATION_TASKS,
-    BROKEN,
-    CLONED_TASKS,
-    CLOUD,
-    ELEVATIONS,
-    FOREIGN,
-    FOREIGN_MOVED,
-    ORACLE,
-    ORACLE_RGB,
-    PERSP,
-    PLACEMENTS,
-    PLAIN,
-    PLAIN_RGB,
-    REPROJ,
-    SECOND_CAMERA,
-    SENSORS,
-    SIDE,
-    SIDE_RGB,
-    TRANSFERRED,
-    VOXEL,
-    WITH_ERRORS,
-    MethodRow,
-    at_elevation,
-    method_row,
-    seeing_more,
-    with_plane_height,
-    with_varying_camera,
-)
-from symview_eval.experiments.scale import Algorithm, Scale
-from symview_eval.experiments.simulators import FOREIGN_TASKS
-from symview_sim.tasks import TASK_NAMES
+from symview_eval.experiments.rows import MethodRow
+from symview_eval.experiments.scale import Algorithm, ChunkTraining, Scale
+from symview_eval.experiments.tables import EXPERIMENTS, Experiment
+from symview_sim.control import CONTROLS
 
 HARDER_TASKS = ("block_in_bowl", "block_stacking")  # paper A.3: 50 demonstrations and twice the steps for SACfD
 RL_DEMONSTRATIONS, RL_DEMONSTRATIONS_HARDER = 20, 50
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """A table or figure of the paper."""
-
-    name: str
-    title: str
-    rows: tuple[MethodRow, ...]
-    tasks: tuple[str, ...]
-    demonstrations: tuple[int, ...] = (5, 10, 50)
-    """Numbers of demonstrations for behaviour cloning; for reinforcement learning the paper fixes one per task."""
-    algorithm: Algorithm = "bc"
-    placements: tuple[tuple[str, CameraSpec], ...] = ()
-    """Names and cameras of the evaluations after the training; by default there is one camera, the demonstrations'."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +45,13 @@ class Cell:
         azimuth = f"_azimuth{camera.azimuth_deg:g}" if camera.azimuth_deg else ""
         kind = f"{azimuth}{'_varying' if camera.varies else ''}{'' if camera.sees_robot else '_without_arm'}"
         cameras = "_".join([f"{camera.elevation_deg:g}deg{kind}", *(other.name for other in others)])
-        return f"{self.task}_{cameras}_{self.demonstrations}_seed{self.seed}"
+        world = "".join(f"_{value}" for value in self.world.values())
+        return f"{self.task}{world}_{cameras}_{self.demonstrations}_seed{self.seed}"
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """Settings of the simulator."""
+        return EXPERIMENTS[self.experiment].world
 
     @property
     def placements(self) -> tuple[tuple[str, CameraSpec], ...]:
@@ -99,6 +62,8 @@ class Cell:
     def steps(self) -> int:
         """Training steps of behaviour cloning, or joint steps of reinforcement learning."""
         is_harder = self.task in HARDER_TASKS
+        if self.chunks is not None:
+            return self.row.longer * self.chunks.steps * (2 if is_harder else 1)
         if self.algorithm == "bc":
             return self.row.longer * (self.scale.harder_steps if is_harder else self.scale.steps)
         return self.scale.rl_steps * (2 if is_harder else 1)
@@ -106,7 +71,30 @@ class Cell:
     @property
     def batch_size(self) -> int:
         """Frames or transitions per step."""
+        if self.chunks is not None:
+            return self.chunks.batch_size
         return self.scale.batch_size if self.algorithm == "bc" else self.scale.rl_batch_size
+
+    @property
+    def chunks(self) -> ChunkTraining | None:
+        """The training of its policy of action chunks; None for policies of single actions."""
+        return self.scale.chunks[self.row.chunks] if self.row.chunks else None
+
+    @property
+    def policy_type(self) -> str:
+        """LeRobot's type of its policy."""
+        return self.row.chunks or ("symview_bc" if self.algorithm == "bc" else "symview_sacfd")
+
+    @property
+    def policy_settings(self) -> dict[str, Any]:
+        """The settings of its policy that the scale determines."""
+        return self.scale.policy(self.algorithm) if self.chunks is None else self.chunks.policy
+
+    @property
+    def max_steps(self) -> int:
+        """Actions per evaluation episode at most; the finer the control, the more."""
+        control = CONTROLS[self.world.get("control", "coarse")]
+        return self.scale.max_steps * control.max_steps // CONTROLS["coarse"].max_steps
 
     @property
     def eval_every(self) -> int:
@@ -121,10 +109,12 @@ class Cell:
     @property
     def training(self) -> dict[str, Any]:
         """All settings that determine its policy and the evaluations during the training."""
-        scale, camera = self.scale, self.row.camera
+        camera = self.row.camera
         return {
             "algorithm": self.algorithm,
-            "policy": {**scale.policy(self.algorithm), **self.row.policy},
+            "policy": {**self.policy_settings, **self.row.policy},
+            **({"chunks": self.row.chunks} if self.row.chunks else {}),
+            **({"world": self.world} if self.world else {}),
             "elevation_deg": camera.elevation_deg,
             **({"placed": [camera.azimuth_deg, camera.distance]} if _is_placed(camera) else {}),
             **({"spread": asdict(camera.spread)} if camera.varies else {}),
@@ -135,7 +125,7 @@ class Cell:
             "seed": self.seed,
             "steps": self.steps,
             "batch_size": self.batch_size,
-            "evaluation": [self.eval_every, self.eval_episodes, scale.max_steps],
+            "evaluation": [self.eval_every, self.eval_episodes, self.max_steps],
         }
 
     @property
@@ -165,142 +155,6 @@ def _is_placed(camera: CameraSpec) -> bool:
 
 def _hash(settings: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
-
-
-EXPERIMENTS = {
-    experiment.name: experiment
-    for experiment in (
-        Experiment(
-            "table1",
-            "Behaviour cloning from RGBD images",
-            (ORACLE, REPROJ, SIDE, VOXEL, CLOUD, PLAIN),
-            CLONED_TASKS,
-        ),
-        Experiment(
-            "table2",
-            "Behaviour cloning from RGB images",
-            (ORACLE_RGB, PERSP, SIDE_RGB, PLAIN_RGB),
-            CLONED_TASKS,
-        ),
-        Experiment(
-            "table3",
-            "Relaxed and broken symmetry",
-            (
-                REPROJ,
-                method_row("reproj_equi_relaxed", "Reproj. Equi (relaxed)"),
-                method_row("reproj_equi_broken", "Reproj. Equi (broken)"),
-                PERSP,
-                method_row("persp_equi_relaxed", "Persp. Equi (relaxed)"),
-                BROKEN,
-            ),
-            ABLATION_TASKS,
-            (10,),
-        ),
-        Experiment(
-            "table4",
-            "Infill of the reprojected view",
-            (
-                MethodRow(REPROJ.name, "Nearest Interpolation", REPROJ.policy),
-                method_row(
-                    "reproj_equi_occlusion",
-                    "Nearest, or behind the occluder",
-                    "reproj_equi",
-                    view_options={"infill": "occlusion"},
-                ),
-                method_row(
-                    "reproj_equi_splat",
-                    "Footprints of pixels, or behind the occluder",
-                    "reproj_equi",
-                    view_options={"infill": "splat"},
-                ),
-                method_row("reproj_equi_local", "Local interpolation", "reproj_equi", view_options={"infill": "local"}),
-                method_row("reproj_equi_unfilled", "No interpolation", "reproj_equi", view_options={"infill": "none"}),
-            ),
-            ABLATION_TASKS,
-        ),
-        Experiment(
-            "table5",
-            "Plane height of the perspective view",
-            (
-                method_row("persp_equi_broken", "0.0 cm"),
-                with_plane_height("persp_equi_broken_2.5cm", "2.5 cm", 0.025),
-                with_plane_height("persp_equi_broken_5cm", "5.0 cm", 0.05),
-                with_plane_height("persp_equi_broken_dynamic", "dynamic", "gripper"),
-            ),
-            ABLATION_TASKS,
-            (10,),
-        ),
-        Experiment(
-            "figure5",
-            "Soft actor-critic from demonstrations, RGBD images",
-            (ORACLE, REPROJ, SIDE, CLOUD, PLAIN),
-            TASK_NAMES,
-            algorithm="sacfd",
-        ),
-        Experiment(
-            "figure6",
-            "Soft actor-critic from demonstrations, RGB images",
-            (ORACLE_RGB, PERSP, SIDE_RGB, PLAIN_RGB),
-            TASK_NAMES,
-            algorithm="sacfd",
-        ),
-        Experiment(
-            "transfer",
-            "A camera that is moved after the training",
-            (
-                *TRANSFERRED,
-                *(with_varying_camera(row) for row in TRANSFERRED),
-            ),
-            CLONED_TASKS,
-            (10,),
-            placements=PLACEMENTS,
-        ),
-        Experiment(
-            "robustness",
-            "Errors of the camera that the training did not have",
-            WITH_ERRORS,
-            CLONED_TASKS,
-            (10,),
-            placements=SENSORS,
-        ),
-        Experiment(
-            "hidden",
-            "What the arm hides",
-            (
-                ORACLE,
-                REPROJ,
-                seeing_more("memory", "memory", memory=True),
-                seeing_more("two_cameras", "two cameras", SECOND_CAMERA),
-                seeing_more("two_cameras_memory", "two cameras and memory", SECOND_CAMERA, memory=True),
-                seeing_more("without_arm", "arm not drawn", arm=False),
-            ),
-            CLONED_TASKS,
-            (10,),
-        ),
-        Experiment("metaworld", "Simulators that others wrote", FOREIGN, FOREIGN_TASKS, (25,)),
-        Experiment(
-            "metaworld_moved",
-            "Simulators that others wrote, and a camera that is moved after the training",
-            FOREIGN,
-            FOREIGN_TASKS,
-            (25,),
-            placements=FOREIGN_MOVED,
-        ),
-        Experiment(
-            "figure7",
-            "Elevation of the camera",
-            (
-                *(at_elevation(row, elevation) for row in (REPROJ, SIDE, PLAIN) for elevation in ELEVATIONS),
-                *(at_elevation(row, elevation) for row in (PERSP, SIDE_RGB, PLAIN_RGB) for elevation in ELEVATIONS),
-                ORACLE,
-                ORACLE_RGB,
-            ),
-            CLONED_TASKS,
-            (10,),
-        ),
-    )
-}
-"""Name -> experiment. In `figure7` the oracle's camera has an elevation of 90 degrees."""
 
 
 def select(

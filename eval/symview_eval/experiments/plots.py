@@ -9,9 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from symview_eval.experiments.grid import Experiment
 from symview_eval.experiments.results import Result
 from symview_eval.experiments.summary import PlacementEntry, TableEntry
+from symview_eval.experiments.tables import Experiment
 
 MEASURED_COLOR, PAPER_COLOR = "#1f5fa8", "#c2571a"
 

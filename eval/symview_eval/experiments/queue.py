@@ -9,16 +9,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_symview.registry import lookup
-from symview_eval.experiments.grid import EXPERIMENTS, Cell, Experiment, select
+from symview_eval.experiments.grid import Cell, select
 from symview_eval.experiments.results import Result
+from symview_eval.experiments.rows import MethodRow
 from symview_eval.experiments.scale import Scale
 from symview_eval.experiments.simulators import FOREIGN_TASKS
+from symview_eval.experiments.tables import EXPERIMENTS, Experiment
 from symview_sim.tasks import TASK_NAMES
 
 ALL = "all"
 FIRST_TASKS = ("block_picking", "drawer_opening")  # of the figures
 FIRST_FOREIGN_TASKS = ("push-v3", "pick-place-v3", "reach-v3", "plate-slide-v3")
 TRANSFER_TASKS = ("block_picking", "block_pushing", "drawer_opening")
+FIRST_CHUNK_TASKS = ("block_picking", "block_pushing", "block_stacking")
 
 
 @dataclass(frozen=True)
@@ -38,20 +41,21 @@ class Costs:
             table, _, task, row = path.parts[:4]  # as in `Cell.path`
             cell_seconds = result.origin.seconds if math.isnan(result.times.cpu_s) else result.times.cpu_s
             if row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
-                for key in _keys(EXPERIMENTS[table], rows[row].policy["method"], task):
+                for key in _keys(EXPERIMENTS[table], rows[row], task):
                     seconds.setdefault(key, []).append(cell_seconds)
         return cls({key: statistics.median(values) for key, values in seconds.items()})
 
     def seconds(self, cell: Cell) -> float | None:
         """Return the expected seconds of a cell; None before any cell of its algorithm is finished."""
-        for key in _keys(EXPERIMENTS[cell.experiment], cell.row.policy["method"], cell.task):
+        for key in _keys(EXPERIMENTS[cell.experiment], cell.row, cell.task):
             if key in self.medians:
                 return self.medians[key]
         return None
 
 
-def _keys(experiment: Experiment, method: str, task: str) -> list[tuple[str, ...]]:
-    kind = experiment.name if experiment.placements else experiment.algorithm
+def _keys(experiment: Experiment, row: MethodRow, task: str) -> list[tuple[str, ...]]:
+    kind = experiment.name if experiment.placements or row.chunks else experiment.algorithm
+    method = row.name if row.chunks else row.policy["method"]
     return [(kind, method, task), (kind, method), (kind,)]
 
 
@@ -106,6 +110,8 @@ def _rank(cell: Cell) -> int:
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
         return 2
     if cell.experiment in ("transfer", "robustness", "hidden") and cell.task in TRANSFER_TASKS:
+        return 2
+    if cell.experiment in ("chunks", "chunks_moved") and cell.task in FIRST_CHUNK_TASKS:
         return 2
     if cell.experiment.startswith("metaworld") and (cell.task in FIRST_FOREIGN_TASKS or cell.seed == 0):
         return 2

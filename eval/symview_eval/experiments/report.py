@@ -12,7 +12,6 @@ import jinja2
 
 from lerobot_symview.runtime.cli import CommandError
 from symview_eval.contact_sheet import data_uri
-from symview_eval.experiments.grid import EXPERIMENTS, Experiment
 from symview_eval.experiments.scale import SCALES, Scale
 from symview_eval.experiments.summary import (
     Entry,
@@ -25,6 +24,7 @@ from symview_eval.experiments.summary import (
     scales_with_results,
     table_entries,
 )
+from symview_eval.experiments.tables import EXPERIMENTS, Experiment
 
 logger = logging.getLogger(__name__)
 

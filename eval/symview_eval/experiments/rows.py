@@ -20,13 +20,17 @@ class MethodRow:
     label: str
     """Its name in the paper."""
     policy: dict[str, Any] = field(hash=False)
-    """Policy settings: `method`, and overrides of that method's settings."""
+    """Policy settings: `method`, and overrides of that method's settings. A policy of LeRobot's own sees what a policy
+    of ours with these settings sees."""
     camera: CameraSpec = field(default_factory=CameraSpec)
     """The camera of the demonstrations; by default the paper's, 45 degrees above the table."""
     more_cameras: tuple[CameraSpec, ...] = ()
     """Further cameras, which the view merges."""
     longer: int = 1
     """Factor of the number of training steps."""
+    chunks: str = ""
+    """Type of its policy of action chunks, a key of `Scale.chunks`; by default it is `symview_bc` with single actions,
+    or in reinforcement learning `symview_sacfd`."""
 
     @property
     def remembers(self) -> bool:
@@ -150,6 +154,30 @@ FOREIGN = (
     in_foreign_world(SIDE),
     in_foreign_world(PLAIN),
     in_foreign_world(method_row("sideview_equi_longer", "Sideview Equi, 5 x as many steps", "sideview_equi"), longer=5),
+)
+
+
+CHUNKS_MOVED = (
+    ("training", CameraSpec()),
+    *((f"azimuth {azimuth:+d}°", CameraSpec(azimuth_deg=azimuth)) for azimuth in (-90, -45, 45, 90)),
+)
+
+
+def _in_chunks(chunks: str, name: str, label: str, method: str, **policy: Any) -> MethodRow:
+    """Return the row of a type of policy that predicts chunks, with what a method sees."""
+    return replace(method_row(f"{chunks.removeprefix('symview_')}_{name}", label, method, **policy), chunks=chunks)
+
+
+CHUNKED = (
+    _in_chunks("symview_flow", "oracle_equi", "Oracle Equi, flow", "oracle_equi"),
+    _in_chunks("symview_flow", "reproj_equi", "Reproj. Equi, flow", "reproj_equi"),
+    _in_chunks("symview_flow", "sideview_equi", "Sideview Equi, flow", "sideview_equi"),
+    _in_chunks("symview_flow", "reproj_nonequi", "Reproj. NonEqui, flow", "reproj_equi", encoder="plain"),
+    _in_chunks("symview_bc", "reproj_equi", "Reproj. Equi, regression of chunks", "reproj_equi"),
+    _in_chunks("act", "reproj", "ACT, reprojected view", "reproj_equi", modality="rgb"),
+    _in_chunks("act", "sideview", "ACT, side image", "sideview_equi", modality="rgb"),
+    _in_chunks("diffusion", "reproj", "Diffusion Policy, reprojected view", "reproj_equi", modality="rgb"),
+    _in_chunks("diffusion", "sideview", "Diffusion Policy, side image", "sideview_equi", modality="rgb"),
 )
 
 

@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 Algorithm = Literal["bc", "sacfd"]
+
+
+@dataclass(frozen=True)
+class ChunkTraining:
+    """The training of one type of policy of action chunks."""
+
+    steps: int
+    """Training steps, twice as many for the harder tasks: of all types, they take about the same time."""
+    batch_size: int
+    """Samples per training step."""
+    policy: dict[str, Any] = field(hash=False)
+    """Policy settings."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,8 @@ class Scale:
     """Policy settings of reinforcement learning."""
     dtype: str = "float32"
     """Precision of convolutions."""
+    chunks: dict[str, ChunkTraining] = field(default_factory=dict, hash=False, repr=False)
+    """Type of a policy of action chunks, ours or LeRobot's own -> its training."""
 
     def policy(self, algorithm: Algorithm) -> dict[str, Any]:
         """Return the policy settings that the scale determines."""
@@ -65,7 +79,55 @@ class Scale:
         return {name: getattr(self, name) for name in [*names, "learning_rate_decay", "aperture_noise"]}
 
     def __str__(self) -> str:
-        return ", ".join(f"{setting.name}={getattr(self, setting.name)}" for setting in fields(self))
+        return ", ".join(f"{shown.name}={getattr(self, shown.name)}" for shown in fields(self) if shown.repr)
+
+
+CHUNKS = {"n_obs_steps": 2, "horizon": 16, "n_action_steps": 8}
+ACT_CHUNKS = {"chunk_size": 16, "n_action_steps": 8}
+FROM_SCRATCH = {"pretrained_backbone_weights": None}
+PAPER = {"width": 64, "crop_size": 128, "dtype": "bfloat16"}
+PAPER_CHUNKS = {
+    "symview_flow": ChunkTraining(5000, 128, PAPER | CHUNKS),
+    "symview_bc": ChunkTraining(5000, 128, PAPER | CHUNKS),
+    "act": ChunkTraining(5000, 128, FROM_SCRATCH | ACT_CHUNKS),
+    "diffusion": ChunkTraining(5000, 128, FROM_SCRATCH | CHUNKS | {"use_group_norm": True, "crop_shape": (128, 128)}),
+}
+LAPTOP = {"width": 16, "crop_size": 64, "aperture_noise": 0.03, "weight_averaging": 0.99}
+LAPTOP_CHUNKS = {
+    "symview_flow": ChunkTraining(2000, 8, LAPTOP | CHUNKS),
+    "symview_bc": ChunkTraining(2000, 8, LAPTOP | CHUNKS | {"learning_rate_decay": "cosine"}),
+    "act": ChunkTraining(
+        400,
+        8,
+        FROM_SCRATCH
+        | ACT_CHUNKS
+        | {
+            "dim_model": 128,
+            "n_heads": 4,
+            "dim_feedforward": 512,
+            "n_encoder_layers": 2,
+            "n_vae_encoder_layers": 2,
+            "optimizer_lr": 1e-4,
+            "optimizer_lr_backbone": 1e-4,
+        },
+    ),
+    "diffusion": ChunkTraining(
+        400,
+        8,
+        FROM_SCRATCH
+        | CHUNKS
+        | {
+            "crop_shape": (64, 64),
+            "use_group_norm": True,
+            "down_dims": (64, 128, 256),
+            "noise_scheduler_type": "DDIM",
+            "num_inference_steps": 16,
+            "optimizer_lr": 5e-4,
+            "scheduler_warmup_steps": 50,
+        },
+    ),
+}
+"""Sizes that fit two cores; ResNet-18 is the smallest encoder that ACT and Diffusion Policy have."""
 
 
 SCALES = {
@@ -87,6 +149,7 @@ SCALES = {
             rl_eval_episodes=100,
             simulators=16,
             dtype="bfloat16",
+            chunks=PAPER_CHUNKS,
         ),
         Scale(
             "laptop",
@@ -107,6 +170,7 @@ SCALES = {
             learning_rate_decay="cosine",
             aperture_noise=0.03,
             rl_policy={"bc_weight": 10.0, "grad_clip_norm": 10.0, "learning_rate_decay": "cosine"},
+            chunks=LAPTOP_CHUNKS,
         ),
         Scale(
             "smoke",
@@ -126,6 +190,7 @@ SCALES = {
             seeds=1,
             max_steps=2,
             demonstrations=(1,),
+            chunks={name: replace(training, steps=2, batch_size=2) for name, training in LAPTOP_CHUNKS.items()},
         ),
     )
 }

@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from symview_eval.experiments.grid import Experiment, select
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.results import Checkpoint, Result, read_result
 from symview_eval.experiments.rows import MethodRow
 from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.tables import Experiment
 from symview_eval.statistics import SuccessRate
 
 LAST_CHECKPOINTS = 5  # checkpoints whose mean is reported

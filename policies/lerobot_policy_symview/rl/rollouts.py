@@ -5,7 +5,9 @@ from __future__ import annotations
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +24,7 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.geometry.units import METRES
 from symview_sim.settings import WorldSettings
-from symview_sim.simulators import Observation, Reset, SimulatorConfig, Simulators, Step
+from symview_sim.simulators import Observation, Outcome, Reset, SimulatorConfig, Simulators, Step
 
 EVALUATION_SEED = 1000  # first seed of lerobot-eval, so that both evaluate on the same scenes
 
@@ -34,20 +36,36 @@ class Actor:
     """A policy with its processors, which acts on the observations of simulators.
 
     Args:
-        policy: the policy; its episodes start and end at different times, so it must not have a memory.
-
-    Raises:
-        ValueError: if the policy has a memory.
+        policy: the policy.
     """
 
     def __init__(self, policy: SymviewPolicy):
-        if isinstance(policy, ChunkPolicy) and not policy.config.is_reactive:
-            raise ValueError(
-                f"{policy.name} with --policy.n_obs_steps={policy.config.n_obs_steps} and "
-                f"--policy.horizon={policy.config.horizon} remembers observations and actions: use lerobot-eval"
-            )
-        self.policy = policy
+        self.policy: Any = policy
+        self.scene = policy.scene
         self.preprocessor, self.postprocessor = make_processors(policy.config, depth_units=metric_depth(policy.config))
+
+    @property
+    def remembers(self) -> bool:
+        """Whether an action depends on earlier observations of the episode, or was planned with them."""
+        return isinstance(self.policy, ChunkPolicy) and not self.policy.config.is_reactive
+
+    def copy(self) -> Actor:
+        """Return an actor with a copy of the policy as it is now."""
+        return Actor(deepcopy(self.policy))
+
+    def see(self, observation: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return observations (B, ...) with all that `scene` reads: what preprocessing does with each frame alone."""
+        seen: dict[str, Tensor] = self.preprocessor(observation)
+        return seen
+
+    def finish(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the policy takes, for observations that `see` returned, and with a history (B, T, ...)."""
+        return batch
+
+    def start_episodes(self, seed: int) -> None:
+        """Forget the last episodes. What the policy draws at random follows from the seed; it is PyTorch's seed."""
+        self.policy.reset()
+        torch.manual_seed(seed)
 
     def preprocess(self, observations: list[Observation]) -> dict[str, Tensor]:
         """Return B observations as a preprocessed batch."""
@@ -55,10 +73,7 @@ class Actor:
         stacked = {
             name: torch.from_numpy(np.stack([observation[name] for observation in observations])) for name in names
         }
-        batch: dict[str, Tensor] = self.preprocessor(
-            {name: _to_lerobot_layout(values) for name, values in stacked.items()}
-        )
-        return batch
+        return self.finish(self.see({name: _to_lerobot_layout(values) for name, values in stacked.items()}))
 
     def __call__(self, observations: list[Observation]) -> NDArray[np.float32]:
         """Return the evaluation actions (B, A), in metres and radians."""
@@ -121,9 +136,9 @@ class Evaluation:
 
 
 @dataclass
-class _EvaluationEpisode:
+class _Episode:
     seed: int
-    observation: Observation | None = None
+    observation: Observation
     steps: int = 0
     discounted_return: float = 0.0
 
@@ -133,43 +148,92 @@ def evaluate(
 ) -> Evaluation:
     """Run one episode per seed; an episode whose simulator dies is run again.
 
+    An actor that remembers runs its episodes in lockstep: as many as there are simulators start together, and the next
+    ones when all of these have ended. What it draws at random follows from the seeds and the number of simulators;
+    PyTorch's random numbers are those of all threads, so no other thread may draw any meanwhile.
+
     Args:
         select_actions: the policy, such as an `Actor`.
         simulators: simulators to run in, as many episodes at a time.
         seeds: seeds of the episodes.
         discount: discount factor of the returns.
     """
-    waiting = deque(seeds)
-    running: dict[int, _EvaluationEpisode] = {}
-    finished: dict[int, tuple[bool, float]] = {}
     with tqdm(total=len(seeds), desc="evaluation", unit="episode", leave=False) as bar:
-        while waiting or running:
-            _start_episodes(simulators, running, waiting)
-            actions = select_actions(
-                [episode.observation for episode in running.values() if episode.observation is not None]
-            )
-            for index, action in zip(running, actions, strict=True):
-                simulators.send(index, Step(action, next_seed=None))
-            for index, episode in list(running.items()):
-                outcome = simulators.receive(index)
-                episode.discounted_return += discount**episode.steps * outcome.reward
-                episode.steps += 1
-                episode.observation = outcome.observation
-                if outcome.lost:
-                    waiting.appendleft(running.pop(index).seed)
-                elif outcome.last is not None:
-                    del running[index]
-                    finished[episode.seed] = (outcome.success, episode.discounted_return)
-                    bar.update()
-    success, discounted_return = zip(*(finished[seed] for seed in seeds), strict=True)
+        episodes = _Episodes(simulators, seeds, discount, bar)
+        if isinstance(select_actions, Actor) and select_actions.remembers:
+            _run_in_lockstep(select_actions, episodes)
+        else:
+            _run_independently(select_actions, episodes)
+    success, discounted_return = zip(*(episodes.finished[seed] for seed in seeds), strict=True)
     return Evaluation(list(success), list(discounted_return))
 
 
-def _start_episodes(simulators: Simulators, running: dict[int, _EvaluationEpisode], waiting: deque[int]) -> None:
-    """Start an episode in every idle simulator while seeds are waiting."""
-    started = [index for index in range(len(simulators)) if index not in running][: len(waiting)]
-    for index in started:
-        running[index] = _EvaluationEpisode(waiting.popleft())
-        simulators.send(index, Reset(running[index].seed))
-    for index in started:
-        running[index].observation = simulators.receive(index).observation
+def _run_independently(select_actions: SelectActions, episodes: _Episodes) -> None:
+    """Start an episode wherever one has ended."""
+    while episodes.waiting or episodes.running:
+        episodes.start()
+        actions = select_actions([episode.observation for episode in episodes.running.values()])
+        episodes.step(dict(zip(episodes.running, actions, strict=True)))
+
+
+def _run_in_lockstep(actor: Actor, episodes: _Episodes) -> None:
+    """Start episodes together. Those that have ended keep their last observation: the policy knows them by row."""
+    with torch.random.fork_rng():
+        while episodes.waiting:
+            episodes.start()
+            rows = dict(episodes.running)
+            actor.start_episodes(next(iter(rows.values())).seed)
+            while episodes.running:
+                actions = actor([episode.observation for episode in rows.values()])
+                chosen = zip(rows, actions, strict=True)
+                episodes.step({index: action for index, action in chosen if index in episodes.running})
+
+
+class _Episodes:
+    """Evaluation episodes: those that wait, those that run, by their simulator, and the results of the others.
+
+    Args:
+        simulators: simulators to run in.
+        seeds: seeds of the episodes.
+        discount: discount factor of the returns.
+        bar: counts finished episodes.
+    """
+
+    def __init__(self, simulators: Simulators, seeds: Sequence[int], discount: float, bar: tqdm[Any]):
+        self._simulators, self._discount, self._bar = simulators, discount, bar
+        self.waiting = deque(seeds)
+        self.running: dict[int, _Episode] = {}
+        self.finished: dict[int, tuple[bool, float]] = {}
+        """Seed -> success and discounted return."""
+
+    def start(self) -> None:
+        """Start an episode in every idle simulator while seeds are waiting."""
+        idle = [index for index in range(len(self._simulators)) if index not in self.running]
+        started = {index: self.waiting.popleft() for index in idle[: len(self.waiting)]}
+        for index, seed in started.items():
+            self._simulators.send(index, Reset(seed))
+        for index, seed in started.items():
+            self.running[index] = _Episode(seed, self._observed(self._simulators.receive(index)))
+
+    def step(self, actions: dict[int, NDArray[np.float32]]) -> None:
+        """Carry out an action in each simulator that runs an episode."""
+        for index, action in actions.items():
+            self._simulators.send(index, Step(action, next_seed=None))
+        for index in actions:
+            outcome, episode = self._simulators.receive(index), self.running[index]
+            episode.discounted_return += self._discount**episode.steps * outcome.reward
+            episode.steps += 1
+            episode.observation = self._observed(outcome)
+            if outcome.lost:
+                self.waiting.appendleft(self.running.pop(index).seed)
+            elif outcome.last is not None:
+                del self.running[index]
+                self.finished[episode.seed] = (outcome.success, episode.discounted_return)
+                self._bar.update()
+
+    @staticmethod
+    def _observed(outcome: Outcome) -> Observation:
+        """Return the present observation, or the last one of an episode that has ended."""
+        observed = outcome.observation if outcome.last is None else outcome.last
+        assert observed is not None  # only an episode that has ended has none
+        return observed

@@ -19,11 +19,12 @@ from lerobot_symview.runtime.locking import RUN_LOCK, locked
 from symview_eval.experiments import cells as cells_module
 from symview_eval.experiments import cli, queue
 from symview_eval.experiments.cli import ExperimentConfig, run_experiment
-from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import read_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import placement_entries, table_entries
+from symview_eval.experiments.tables import EXPERIMENTS
 
 pytestmark = pytest.mark.long
 

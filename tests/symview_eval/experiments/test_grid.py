@@ -1,10 +1,11 @@
 import pytest
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from symview_eval.experiments.cloning import policy_config
-from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.actors import sight
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import paper_values
+from symview_eval.experiments.tables import EXPERIMENTS
 
 LAPTOP = SCALES["laptop"]
 
@@ -26,7 +27,7 @@ def test_every_row_configures_a_policy(name, scale):
         if cell.algorithm == "sacfd":
             policy = SymviewSacfdConfig(device="cpu", **scale.policy(cell.algorithm), **row.policy)
         else:
-            policy = policy_config(cell, "cpu")
+            policy = sight(cell, "cpu")
         assert policy.method == row.policy["method"]
         assert policy.crop_size == scale.crop_size
         if policy.is_computed and cell.algorithm == "bc":

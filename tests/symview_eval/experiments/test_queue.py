@@ -2,10 +2,11 @@ from dataclasses import replace
 
 import pytest
 
-from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.queue import Costs, chosen_cells, distinct, remaining
 from symview_eval.experiments.results import Times, finished_results, write_result
 from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.tables import EXPERIMENTS
 
 from .test_results import result
 

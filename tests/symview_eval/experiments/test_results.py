@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.results import (
     Checkpoint,
     Origin,
@@ -15,6 +15,7 @@ from symview_eval.experiments.results import (
     write_result,
 )
 from symview_eval.experiments.scale import SCALES
+from symview_eval.experiments.tables import EXPERIMENTS
 
 SCALE = SCALES["laptop"]
 

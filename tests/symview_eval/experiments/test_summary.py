@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from symview_eval.experiments.grid import EXPERIMENTS, select
+from symview_eval.experiments.grid import select
 from symview_eval.experiments.plots import plot
 from symview_eval.experiments.results import Checkpoint, write_result
 from symview_eval.experiments.scale import SCALES
@@ -14,6 +14,7 @@ from symview_eval.experiments.summary import (
     scales_with_results,
     table_entries,
 )
+from symview_eval.experiments.tables import EXPERIMENTS
 
 from .test_results import result
 
