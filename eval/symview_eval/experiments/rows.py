@@ -163,16 +163,17 @@ CHUNKS_MOVED = (
 )
 
 
-def _in_chunks(chunks: str, name: str, label: str, method: str, **policy: Any) -> MethodRow:
+def _in_chunks(chunks: str, name: str, label: str, method: str, longer: int = 1, **policy: Any) -> MethodRow:
     """Return the row of a type of policy that predicts chunks, with what a method sees."""
-    return replace(method_row(f"{chunks.removeprefix('symview_')}_{name}", label, method, **policy), chunks=chunks)
+    kind = {"symview_flow": "flow", "symview_bc": "regression"}.get(chunks, chunks)
+    return replace(method_row(f"{kind}_{name}", label, method, **policy), longer=longer, chunks=chunks)
 
 
 CHUNKED = (
     _in_chunks("symview_flow", "oracle_equi", "Oracle Equi, flow", "oracle_equi"),
     _in_chunks("symview_flow", "reproj_equi", "Reproj. Equi, flow", "reproj_equi"),
     _in_chunks("symview_flow", "sideview_equi", "Sideview Equi, flow", "sideview_equi"),
-    _in_chunks("symview_flow", "reproj_nonequi", "Reproj. NonEqui, flow", "reproj_equi", encoder="plain"),
+    _in_chunks("symview_flow", "reproj_nonequi", "Reproj. NonEqui, flow", "reproj_equi", encoder="plain", longer=2),
     _in_chunks("symview_bc", "reproj_equi", "Reproj. Equi, regression of chunks", "reproj_equi"),
     _in_chunks("act", "reproj", "ACT, reprojected view", "reproj_equi", modality="rgb"),
     _in_chunks("act", "sideview", "ACT, side image", "sideview_equi", modality="rgb"),

@@ -1,7 +1,7 @@
 import pytest
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from symview_eval.experiments.actors import sight
+from symview_eval.experiments.actors import policy_config, sight
 from symview_eval.experiments.grid import select
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import paper_values
@@ -28,6 +28,7 @@ def test_every_row_configures_a_policy(name, scale):
             policy = SymviewSacfdConfig(device="cpu", **scale.policy(cell.algorithm), **row.policy)
         else:
             policy = sight(cell, "cpu")
+            assert policy_config(cell, "cpu").type == cell.policy_type
         assert policy.method == row.policy["method"]
         assert policy.crop_size == scale.crop_size
         if policy.is_computed and cell.algorithm == "bc":
@@ -76,6 +77,25 @@ def test_methods_share_demonstrations():
     chosen = cells("table1", tasks=["block_picking"], demos=[10], seeds=[0])
     assert len(chosen) == 6
     assert len({cell.recording for cell in chosen}) == 1
+
+
+def test_chunks_are_of_fine_control_and_share_demonstrations_and_policies():
+    chunks, planned, moved, single = (
+        single_cell(*chosen, "block_picking", method, 25)
+        for *chosen, method in (
+            ("chunks", "flow_reproj_equi"),
+            ("chunks_planner", "flow_reproj_equi"),
+            ("chunks_moved", "flow_reproj_equi"),
+            ("table1", "reproj_equi"),
+        )
+    )
+    assert chunks.recording == moved.recording == "block_picking_fine_human_45deg_25_seed0"
+    assert planned.recording == "block_picking_fine_45deg_25_seed0"
+    assert chunks.training_hash == moved.training_hash
+    assert chunks.configuration_hash != moved.configuration_hash
+    assert len({cell.training_hash for cell in (chunks, planned, single)}) == 3
+    assert (chunks.max_steps, single.max_steps) == (200, 50)
+    assert single_cell("chunks", "block_stacking", "flow_reproj_equi").steps == 2 * chunks.steps
 
 
 def test_rl_uses_the_papers_demonstrations_and_steps():
