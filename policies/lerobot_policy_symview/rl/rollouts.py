@@ -64,6 +64,7 @@ class Actor:
 
     def start_episodes(self, seed: int) -> None:
         """Forget the last episodes. What the policy draws at random follows from the seed; it is PyTorch's seed."""
+        self.policy.eval()  # not all of LeRobot's policies do this themselves
         self.policy.reset()
         torch.manual_seed(seed)
 

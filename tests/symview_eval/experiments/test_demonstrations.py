@@ -25,10 +25,8 @@ ROWS = ["flow_reproj_equi", "regression_reproj_equi", "act_sideview", "diffusion
 def smoke_cell(row, **settings):
     """Return a row's cell; `settings` override the policy's."""
     (cell,) = select(EXPERIMENTS["chunks"], SCALES["smoke"], ["block_picking"], [row])
-    training = cell.chunks
-    changed = {row: training for row, training in cell.scale.chunks.items()}
-    changed[cell.row.chunks] = replace(training, policy=training.policy | settings)
-    return replace(cell, scale=replace(cell.scale, chunks=changed))
+    changed = replace(cell.chunks, policy=cell.chunks.policy | settings)
+    return replace(cell, scale=replace(cell.scale, chunks={cell.row.chunks: changed}))
 
 
 def dataset_and_actor(folder, row, **settings):
