@@ -164,11 +164,17 @@ class ChunkPolicy(SymviewPolicy):
         """
         if self.config.is_reactive:
             return self.predict_action_chunk(batch, noise=noise)[:, 0]
-        self._observations.append(dict(batch))
+        self.check_first_image(batch)
+        self._observations.append(self._seen(batch))
         if not self._planned:
             chunk = self.predict_action_chunk(stacked(self._observations), noise=noise)
             self._planned.extend(chunk[:, : self.config.n_action_steps].unbind(1))
         return self._planned.popleft()
+
+    def _seen(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the network reads of observations: to stack a camera's images takes longer than to make views."""
+        read = {*self.scene.keys, *self.scene.optional_keys}
+        return {name: values for name, values in self.scene.own_names(batch).items() if name in read}
 
     def _noisy(self, state: Tensor) -> Tensor:
         """Return states (..., S) with noise on the apertures."""

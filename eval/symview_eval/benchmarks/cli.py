@@ -14,6 +14,7 @@ EXAMPLES = """\
   symview-benchmark env --json=true
   symview-benchmark views
   symview-benchmark policy --batch_size=32
+  symview-benchmark policy --policy.type=symview_flow --policy.width=16 --policy.crop_size=64 --batch_size=8
   symview-benchmark rl --policy.width=16 --policy.crop_size=64 --batch_size=32
   symview-benchmark experiment --scale=laptop
 

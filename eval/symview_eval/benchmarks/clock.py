@@ -1,10 +1,13 @@
-"""Timing of a call, and of one function inside a larger computation."""
+"""Timing of calls, and of one function inside a larger computation."""
 
 from __future__ import annotations
 
+import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
+
+from tqdm import tqdm
 
 
 def seconds(call: Callable[[], object]) -> float:
@@ -12,6 +15,30 @@ def seconds(call: Callable[[], object]) -> float:
     start = time.perf_counter()
     call()
     return time.perf_counter() - start
+
+
+def medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str) -> dict[str, float]:
+    """Run all calls in turn, once as a warm-up and then `repeats` times; return the median seconds of each.
+
+    Args:
+        calls: what to time, by name. With a GPU, its work is waited for: calls return before it has finished.
+        repeats: timed runs of each call.
+        name: label of the progress bar.
+    """
+    import torch  # only here: worker processes of other suites import this module
+
+    def synchronized(call: Callable[[], object]) -> None:
+        call()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+    times: dict[str, list[float]] = {key: [] for key in calls}
+    for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
+        for key, call in calls.items():
+            duration = seconds(lambda call=call: synchronized(call))  # type: ignore[misc]
+            if repeat:
+                times[key].append(duration)
+    return {key: statistics.median(values) for key, values in times.items()}
 
 
 class Clock:

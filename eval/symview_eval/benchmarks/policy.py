@@ -17,12 +17,13 @@ from typing import Literal
 
 import numpy as np
 import torch
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor, nn
 from torch.nn import functional
-from tqdm import tqdm
 
 from lerobot_policy_symview.configuration import CROP_SIZES
+from lerobot_policy_symview.configuration_chunks import ChunkConfig
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.inputs.voxels import HEIGHT, SIDE, VOXEL_CHANNELS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
@@ -32,6 +33,8 @@ from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
+from symview_eval.benchmarks.clock import medians
+from symview_eval.benchmarks.tick import benchmark_ticks
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 
@@ -46,7 +49,10 @@ MARGIN = 24  # pixels between the image and its random crop: the paper crops 152
 
 @dataclass(frozen=True)
 class PolicyBenchmark:
-    """Measure training steps, inference, start-up and data loading of symview_bc, as ratios within one run."""
+    """Measure training steps, inference, start-up and data loading of symview_bc, as ratios within one run.
+
+    With `--policy.type`, measure that policy's control tick and training step instead.
+    """
 
     batch_size: int = 128
     """Samples per training step."""
@@ -60,6 +66,8 @@ class PolicyBenchmark:
     """Precision of our convolutions. escnn runs in float32, the plain network in the faster of the two."""
     device: str = "cpu"
     """PyTorch device of the networks, such as `cuda`; data is loaded on the CPU."""
+    policy: PreTrainedConfig | None = None
+    """`--policy.type=symview_flow` or `symview_bc`, with sizes of its own (`--policy.width`, `--policy.crop_size`)."""
     json: bool = False
     """Print one JSON object instead of a table."""
 
@@ -75,6 +83,8 @@ class PolicyBenchmark:
             torch.empty(0, device=self.device)
         except (AssertionError, RuntimeError) as error:
             raise ValueError(f"--device={self.device} is not available here: {error}") from None
+        if self.policy is not None and not isinstance(self.policy, ChunkConfig):
+            raise ValueError(f"--policy.type must be symview_flow or symview_bc, got {self.policy.type}")
 
 
 class PlainNetwork(nn.Module):
@@ -130,8 +140,11 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
         `train_step_floor_s`: the plain network's arithmetic at the rate of large matrix products in `--dtype`.
         `voxel_train_step_ratio`: the voxel encoder's training step over that of whole convolutions, for 8 grids.
         `plugin_import_s`: time that the plugin adds to LeRobot's import. `loader_share`: time to load a batch over the
-        time of a training step. Without the extra `escnn`, the entries of escnn are left out.
+        time of a training step. Without the extra `escnn`, the entries of escnn are left out. With a policy, those of
+        `benchmark_ticks`.
     """
+    if isinstance(config.policy, ChunkConfig):
+        return benchmark_ticks(config.policy, config.batch_size, config.repeats)
     start = time.perf_counter()
     policy = make_policy(config)
     construct = time.perf_counter() - start
@@ -146,7 +159,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     networks |= {f"plain_{dtype}_": (plain, dtype) for dtype in _precisions(config.device)}
     image, state = example_input(config, policy, config.batch_size)
     calls = {name: _training_step(network, image, state, dtype) for name, (network, dtype) in networks.items()}
-    steps = _medians(calls, config.repeats, "step")
+    steps = medians(calls, config.repeats, "step")
     results = {f"{name}train_step_s": seconds for name, seconds in steps.items()}
     results |= {
         "train_step_ratio_plain": steps[""] / _plain(steps),
@@ -160,7 +173,7 @@ def benchmark_policy(config: PolicyBenchmark) -> dict[str, float]:
     for batch in (1, 5):
         inputs = example_input(config, policy, batch)
         calls = {name: _inference(network.eval(), *inputs, dtype) for name, (network, dtype) in networks.items()}
-        times = _medians(calls, 10 * config.repeats, f"inference of {batch}")
+        times = medians(calls, 10 * config.repeats, f"inference of {batch}")
         results |= {
             f"inference_ms_b{batch}": 1000 * times[""],
             f"inference_ratio_b{batch}": times[""] / _plain(times),
@@ -235,26 +248,6 @@ def _inference(network: nn.Module, image: Tensor, state: Tensor, dtype: str) -> 
     return run
 
 
-def _medians(calls: Mapping[str, Callable[[], object]], repeats: int, name: str) -> dict[str, float]:
-    """Run all calls in turn, once as a warm-up and then `repeats` times; return the median seconds of each."""
-    times: dict[str, list[float]] = {key: [] for key in calls}
-    for repeat in tqdm(range(repeats + 1), desc=name, unit="round", leave=False):
-        for key, call in calls.items():
-            _synchronize()
-            start = time.perf_counter()
-            call()
-            _synchronize()
-            if repeat:
-                times[key].append(time.perf_counter() - start)
-    return {key: statistics.median(values) for key, values in times.items()}
-
-
-def _synchronize() -> None:
-    """Wait for the GPU, if there is one: calls return before it has finished."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-
-
 def voxel_ratio(config: PolicyBenchmark) -> float:
     """Return the training step of the voxel encoder over that with whole convolutions, for a table with blocks."""
     encoder = VoxelEncoder(make_group("D4"), np.zeros((8, 0, 0)), config.width).to(config.device)
@@ -263,7 +256,7 @@ def voxel_ratio(config: PolicyBenchmark) -> float:
     state = torch.zeros(VOXEL_BATCH, 0, device=config.device)
     networks = {"sparse": encoder, "whole": WholeConvolutions(encoder)}
     calls = {name: _training_step(network, grid, state, config.dtype) for name, network in networks.items()}
-    times = _medians(calls, config.repeats, "step of voxels")
+    times = medians(calls, config.repeats, "step of voxels")
     return times["sparse"] / times["whole"]
 
 
@@ -281,7 +274,7 @@ def _dense_operations(network: PlainNetwork, config: PolicyBenchmark) -> float:
 def _operations_per_second(config: PolicyBenchmark, size: int = 1024, repeats: int = 5) -> float:
     """Return the measured rate of matrix products, the fastest arithmetic of the device."""
     a, b = torch.rand(2, size, size, device=config.device, dtype=getattr(torch, config.dtype))
-    return 2 * size**3 / _medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
+    return 2 * size**3 / medians({"": lambda: torch.mm(a, b)}, repeats, "matrix product")[""]
 
 
 def plugin_import_seconds() -> float:

@@ -3,11 +3,15 @@ import json
 import pytest
 import torch
 
+from lerobot_policy_symview.chunks import ChunkPolicy
+from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
+from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.nn.encoders.convolutional import ConvolutionalEncoder
 from lerobot_policy_symview.nn.escnn_bridge import EscnnEncoder
 from symview_eval.benchmarks import cli, experts
 from symview_eval.benchmarks import policy as policy_benchmark
 from symview_eval.benchmarks import rl as rl_benchmark
+from symview_eval.benchmarks import tick as tick_benchmark
 from symview_eval.benchmarks import views as views_benchmark
 
 pytestmark = pytest.mark.long
@@ -166,6 +170,49 @@ def test_the_policy_benchmark_runs_in_bfloat16(monkeypatch):
         "ConvolutionalEncoder": {torch.bfloat16},
         "EscnnEncoder": {torch.float32},
     }
+
+
+@pytest.mark.parametrize("kind", ["symview_flow", "symview_bc"])
+def test_a_policy_is_timed_as_it_acts_and_trains(kind, monkeypatch, capsys):
+    for name, value in {"ROWS": 96, "COLUMNS": 128, "FRAMES": 3}.items():
+        monkeypatch.setattr(tick_benchmark, name, value)
+    predicted = []
+    predict = ChunkPolicy.predict_action_chunk
+    monkeypatch.setattr(
+        ChunkPolicy,
+        "predict_action_chunk",
+        lambda *inputs, **options: predicted.append(1) or predict(*inputs, **options),
+    )
+    sizes = ["--policy.width=16", "--policy.crop_size=64", "--policy.device=cpu", "--batch_size=2", "--repeats=1"]
+    monkeypatch.setattr("sys.argv", ["symview-benchmark", "policy", f"--policy.type={kind}", *sizes, "--json"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 0
+    results = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert len(predicted) == 12 + 8  # chunks, and one for each element of D4
+    assert results["tick_limit_ms"] == 25
+    assert results["train_step_limit_encoder"] == 1.3
+    assert results["cores"] == 1
+    parts = sum(results[f"{part}_ms"] for part in ("view", "encoder", "head", "other"))
+    assert results["tick_ms"] == pytest.approx(parts)
+    assert 0 < results["equivariance_error"] < 1e-4
+    assert results["tick_mean_ms"] > 0
+    assert results["train_step_ratio_encoder"] == results["train_step_s"] / results["encoder_step_s"]
+
+
+def test_only_policies_of_chunks_have_ticks():
+    with pytest.raises(ValueError, match=r"--policy.type must be symview_flow or symview_bc, got symview_sacfd"):
+        policy_benchmark.PolicyBenchmark(policy=SymviewSacfdConfig())
+
+
+@pytest.mark.parametrize("method", ["sideview_equi", "oracle_equi", "point_cloud_equi"])
+def test_ticks_of_other_methods(method, monkeypatch):
+    for name, value in {"ROWS": 96, "COLUMNS": 128, "FRAMES": 2}.items():
+        monkeypatch.setattr(tick_benchmark, name, value)
+    config = SymviewFlowConfig(method=method, width=32, crop_size=64, device="cpu")
+    results = tick_benchmark.benchmark_ticks(config, batch_size=2, repeats=1)
+    assert "tick_limit_ms" not in results
+    assert results["tick_ms"] > 0
 
 
 @pytest.mark.parametrize(("option", "value"), [("dtype", "float16"), ("device", "cuda:99"), ("device", "abacus")])
