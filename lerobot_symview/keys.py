@@ -11,6 +11,7 @@ STATE_NAMES = ["x", "y", "z", "yaw", "aperture"]
 ACTION_NAMES = ["dx", "dy", "dz", "dyaw", "aperture"]
 IMAGES, CALIBRATIONS = "observation.images.", "observation.camera."
 ORACLE = "top"  # the simulator's camera straight above the table
+WRIST = "wrist"  # the simulator's camera on the gripper
 
 
 def rgb(camera: str) -> str:

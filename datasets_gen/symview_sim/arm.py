@@ -109,7 +109,7 @@ class Arm:
     @property
     def yaw(self) -> float:
         """Angle of the fingers' opening axis about z, in [-pi/2, pi/2), rad."""
-        return float((self._heading + np.pi / 2) % np.pi - np.pi / 2)
+        return float((self.heading + np.pi / 2) % np.pi - np.pi / 2)
 
     @property
     def aperture(self) -> float:
@@ -154,7 +154,7 @@ class Arm:
         return self._client.getLinkState(self.body, self._spec.hand_link, computeForwardKinematics=True)
 
     @property
-    def _heading(self) -> float:
+    def heading(self) -> float:
         """Yaw modulo 2 pi, which distinguishes the two fingers, rad."""
         rotation = self._rotation(self._hand_state()[5])
         return float(np.arctan2(rotation[1, 0], rotation[0, 0])) - self._spec.finger_yaw
@@ -164,7 +164,7 @@ class Arm:
 
     def _solve(self, position: ArrayLike, yaw: float) -> list[float]:
         """Return the joint angles, rad, that bring the gripper to `position` (3,) metres and to `yaw` modulo pi."""
-        heading = self._heading
+        heading = self.heading
         yaw_change = yaw_difference(heading, yaw, period=np.pi)
         lower, upper = self._wrist_limits
         # If the shorter rotation exceeds the wrist's limits, rotate in the opposite direction.

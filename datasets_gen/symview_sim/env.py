@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from typing import Any, cast
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_symview.geometry.camera import Camera
+from lerobot_symview import keys
+from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.registry import lookup
 from lerobot_symview.runtime.staging import plain
+from symview_sim.arm import Arm
 from symview_sim.camera_rig import CameraImages, EnvObservation
 from symview_sim.control import CONTROLS
 from symview_sim.human_style import Hand, Style, draw_style, human_action
 from symview_sim.rendering import render
 from symview_sim.robots import ROBOTS
 from symview_sim.scene import Scene
-from symview_sim.settings import EnvSettings
+from symview_sim.settings import WRIST_SIZE, EnvSettings
 from symview_sim.sight import place_in_sight
 from symview_sim.table_env import TableEnv
 from symview_sim.tasks import make_task
 
 START_HEIGHT = 0.2  # metres
+WRIST_ELEVATION, WRIST_FOV = np.deg2rad(55.0), np.deg2rad(75.0)  # of the camera on the gripper
+WRIST_TARGET, WRIST_DISTANCE = (0.0, 0.0, -0.05), 0.21  # metres: what it looks at, from the fingertips, and from where
 GRIPPER_HEIGHTS = (0.02, 0.25)  # metres, limits of the gripper's z; below 2 cm the fingers touch the table
 
 
 class SymviewEnv(TableEnv):
     """A tabletop manipulation task in PyBullet; observations are those of `TableEnv`.
+
+    With `wrist_camera`, `pixels["wrist"]` uint8 (96, 96, 3) is the image of a camera on the gripper. It turns with the
+    arm's hand, by full turns, whereas the state's yaw is that of two equal fingers.
 
     Action: (5,) float32: dx, dy, dz (metres, each clamped to 0.05, or 0.015 with fine control), dyaw (radians, clamped
     to pi/4, or pi/12), aperture in [0, 1].
@@ -57,6 +66,10 @@ class SymviewEnv(TableEnv):
         limits = self._control.limits.astype(np.float32)
         low, high = np.append(-limits, np.float32(0)), np.append(limits, np.float32(1))
         super().__init__(settings, self.episode_task.instruction, low, high, render_mode)
+        if settings.has_wrist_camera:
+            pixels = cast(gymnasium.spaces.Dict, self.observation_space)["pixels"]
+            image = gymnasium.spaces.Box(0, 255, (WRIST_SIZE, WRIST_SIZE, 3), np.uint8)
+            cast(gymnasium.spaces.Dict, pixels)[keys.WRIST] = image
         self._robot = lookup("robot", settings.robot, ROBOTS)
         self._scene: Scene | None = None
         self._steps = 0
@@ -132,12 +145,25 @@ class SymviewEnv(TableEnv):
         arm = self.scene.arm
         return [*(arm.position - (*self.workspace.center, 0.0)), arm.yaw, arm.aperture]
 
+    def _observe(self, state: Sequence[float]) -> EnvObservation:
+        """Return the observation, with the image of the camera on the gripper if there is one."""
+        observation = super()._observe(state)
+        if self.settings.has_wrist_camera:
+            observation["pixels"][keys.WRIST] = render(self.scene.client, wrist_camera(self.scene.arm)).rgb
+        return observation
+
     def _draw(self, spec: CameraSpec, camera: Camera) -> CameraImages:
         with nullcontext() if spec.sees_robot else self.scene.arm.hidden():
             return render(self.scene.client, camera, labelled=self.settings.segmentation)
 
     def _place(self, spec: CameraSpec, rng: np.random.Generator) -> Camera:
         return place_in_sight(spec, self.scene.client, self.workspace, rng)
+
+
+def wrist_camera(arm: Arm) -> Camera:
+    """Return the camera on the gripper, which sees both fingertips from the plane between them."""
+    pose = orbit_pose(WRIST_ELEVATION, arm.heading + np.pi / 2, WRIST_DISTANCE, arm.position + WRIST_TARGET)
+    return Camera(intrinsics_from_fov(WRIST_FOV, WRIST_SIZE, WRIST_SIZE), pose, WRIST_SIZE, WRIST_SIZE)
 
 
 def make_env(render_mode: str | None = "rgb_array", **options: Any) -> SymviewEnv:

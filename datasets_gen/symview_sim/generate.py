@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lerobot_symview import keys
 from lerobot_symview.datasets.action_targets import relative_action_feature
-from lerobot_symview.datasets.features import Features, camera_features
+from lerobot_symview.datasets.features import Features, camera_features, color_feature
 from lerobot_symview.datasets.hub import push_dataset
 from lerobot_symview.datasets.metadata import RECORDING
 from lerobot_symview.geometry.camera import project
@@ -31,7 +31,7 @@ from symview_sim.recording import (
     recorded_attempts,
     write_shard,
 )
-from symview_sim.settings import EnvSettings, NewDataset, WorldSettings
+from symview_sim.settings import WRIST_SIZE, EnvSettings, NewDataset, WorldSettings
 from symview_sim.table_env import TableEnv
 from symview_sim.worlds.fetch import FetchSettings
 from symview_sim.worlds.metaworld import MetaWorldSettings
@@ -205,6 +205,8 @@ def _features(env: TableEnv, config: GenerateConfig) -> Features:
     for spec in env.specs:
         shown = {"depth": config.env.depth, "segmentation": config.env.has_labels}
         features |= camera_features(spec.name, spec.height, spec.width, env.workspace, **shown)
+    if config.env.has_wrist_camera:
+        features[keys.rgb(keys.WRIST)] = color_feature(WRIST_SIZE, WRIST_SIZE, {"fixed_to": "gripper"})
     if config.video:
         for key, feature in features.items():
             if feature["dtype"] == "image" and key != keys.depth(keys.ORACLE):

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from symview_sim.table_env import TableEnv
 
 STYLES = ("planner", "human")
+WRIST_SIZE = 96  # rows and columns of the camera on the gripper, pixels
 
 
 # Not frozen, because the plugin's environment configurations derive from these classes and from LeRobot's EnvConfig,
@@ -88,6 +89,11 @@ class WorldSettings(ABC):
         return False
 
     @property
+    def has_wrist_camera(self) -> bool:
+        """Whether observations have the image of a camera on the gripper."""
+        return False
+
+    @property
     @abstractmethod
     def actions_per_second(self) -> int:
         """Actions per second of the simulated robot."""
@@ -133,6 +139,8 @@ class EnvSettings(WorldSettings):
     """The robot arm, `panda` or `kuka`."""
     oracle: bool = False
     """Add the camera `top`, which looks straight down and does not see the arm."""
+    wrist_camera: bool = False
+    """Add the colour image of the camera `wrist`, which is fixed to the gripper and looks at its fingertips."""
     segmentation: bool = False
     """Add each camera's segmentation: 0 table, 1 robot, 2 and up the objects."""
     control: str = "coarse"
@@ -157,6 +165,8 @@ class EnvSettings(WorldSettings):
             raise OptionError(str(error)) from None
         if not 0 <= self.start_jitter < math.inf:
             raise OptionError(f"start_jitter must not be negative, got {self.start_jitter}")
+        if self.wrist_camera and keys.WRIST in [spec.name for spec in self.all_cameras]:
+            raise OptionError(f"wrist_camera adds the camera {keys.WRIST!r}, which another camera is called: rename it")
         super().check()
 
     @classmethod
@@ -174,6 +184,11 @@ class EnvSettings(WorldSettings):
     def has_labels(self) -> bool:
         """Whether each camera has segmentation labels."""
         return self.segmentation
+
+    @property
+    def has_wrist_camera(self) -> bool:
+        """Whether observations have the image of a camera on the gripper."""
+        return self.wrist_camera
 
     @property
     def actions_per_second(self) -> int:

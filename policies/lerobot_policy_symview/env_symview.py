@@ -19,7 +19,7 @@ from lerobot_symview.geometry.units import METRES
 from lerobot_symview.runtime.flag_errors import FlagError, flag_errors
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, ViewSpec
-from symview_sim.settings import EnvSettings, WorldSettings
+from symview_sim.settings import WRIST_SIZE, EnvSettings, WorldSettings
 from symview_sim.worlds.fetch import FetchSettings
 from symview_sim.worlds.metaworld import MetaWorldSettings, check_task
 
@@ -60,6 +60,8 @@ class WorldEnvConfig(WorldSettings, EnvConfig):
                 shapes[keys.depth(camera.name)] = (*size, 1)
             if self.has_labels:
                 shapes[keys.segmentation(camera.name)] = (*size, 3)
+        if self.has_wrist_camera:
+            shapes[keys.rgb(keys.WRIST)] = (WRIST_SIZE, WRIST_SIZE, 3)
         for name, view in views.items():
             if view.needs_depth and not self.depth:
                 raise FlagError(f"the view {name!r} needs depth: keep --env.depth=true or use 'persp'")
