@@ -10,8 +10,11 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from lerobot_policy_symview.configuration_chunks import ChunkConfig
+from lerobot_policy_symview.configuration_chunks import ChunkConfig, wrist_key
 from lerobot_policy_symview.inputs.history import as_frames, history_length, latest, stacked, with_length
+from lerobot_policy_symview.inputs.wrist import wrist_input
+from lerobot_policy_symview.nn.encoders.base import Encoder
+from lerobot_policy_symview.nn.encoders.wrist import WristEncoder
 from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.policy import MakeHead, Network, Stats, SymviewPolicy, scale_of
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
@@ -68,6 +71,11 @@ class ChunkPolicy(SymviewPolicy):
         center, width = scale_of(None, config.actions)
         times = (config.horizon, 1) if config.horizon > 1 else (1,)
         return center.repeat(times), width.repeat(times)
+
+    def make_encoder(self) -> Encoder:
+        """Return the encoder of what `network_input` returns; with a gripper camera, it has further fields."""
+        encoder = super().make_encoder()
+        return encoder if self.config.wrist_camera is None else WristEncoder(encoder, self.config.width)
 
     @abstractmethod
     def scaled_chunk(self, network: Network, features: Tensor, noise: Tensor) -> Tensor:
@@ -171,10 +179,37 @@ class ChunkPolicy(SymviewPolicy):
             self._planned.extend(chunk[:, : self.config.n_action_steps].unbind(1))
         return self._planned.popleft()
 
+    def network_input(
+        self, batch: dict[str, Tensor], transform: PlanarTransform | None = None, crop_offset: Tensor | None = None
+    ) -> tuple[Any, Tensor]:
+        """Return the network's input: the observation and the state (B, D).
+
+        With a gripper camera, the observation is a pair of the scene and that camera's images. Arguments are those of
+        `SymviewPolicy.network_input`.
+
+        Raises:
+            KeyError: if the observations lack an image.
+        """
+        config, key = self.config, wrist_key(self.config)
+        if key is None:
+            return super().network_input(batch, transform, crop_offset)
+        if key not in batch:
+            raise KeyError(
+                f"--policy.wrist_camera={config.wrist_camera} needs {key}, the observation has {sorted(batch)}: rename "
+                "the camera's image with --rename_map"
+            )
+        scene = {name: values for name, values in batch.items() if name != key}  # no substitute for the policy's camera
+        observation, state = super().network_input(scene, transform, crop_offset)
+        images = wrist_input(batch[key], config.image_size, config.crop_size, transform, crop_offset)
+        return (observation, images), state
+
     def _seen(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return what the network reads of observations: to stack a camera's images takes longer than to make views."""
+        key = wrist_key(self.config)
         read = {*self.scene.keys, *self.scene.optional_keys}
-        return {name: values for name, values in self.scene.own_names(batch).items() if name in read}
+        scene = self.scene.own_names({name: values for name, values in batch.items() if name != key})
+        seen = {name: values for name, values in scene.items() if name in read}
+        return seen if key not in batch else seen | {key: batch[key]}
 
     def _noisy(self, state: Tensor) -> Tensor:
         """Return states (..., S) with noise on the apertures."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.symmetry.trajectories import Trajectories
+from lerobot_symview import keys
 
 MAX_HORIZON = 256
 
@@ -27,6 +31,9 @@ class ChunkConfig(SymviewConfig):
     action_mode: Literal["delta", "absolute"] = "delta"
     """`delta`: an action moves the gripper from where it is. `absolute`: an action is where the gripper shall be, in
     the state's coordinates."""
+    wrist_camera: str | None = None
+    """Camera on the gripper whose colour image the network sees too, such as `wrist`. It must sit on a plane of
+    symmetry of the gripper and look along it, so that the mirrored scene shows the image with its columns reversed."""
     denoiser_width: int = 256
     """Hidden numbers per group element of the network that predicts chunks."""
 
@@ -56,7 +63,36 @@ class ChunkConfig(SymviewConfig):
                 f"--policy.aperture_noise={self.aperture_noise} needs a dimension `aperture` in "
                 f"--policy.state_symmetry, got {self.state_symmetry}"
             )
+        if self.wrist_camera is not None and not self.wrist_camera.isidentifier():
+            raise ValueError(f"--policy.wrist_camera must be the name of a camera, got {self.wrist_camera!r}")
+        if self.wrist_camera in (self.camera, self.seen_camera, *self.merged_cameras):
+            raise ValueError(
+                f"--policy.wrist_camera={self.wrist_camera} is a camera of the policy's view: name that on the gripper"
+            )
         _ = self.trajectories
+
+    def substitutes(self, names: Collection[str]) -> list[str]:
+        """Return the cameras of a dataset that can take the place of the policy's; the gripper's cannot."""
+        return super().substitutes([name for name in names if name != wrist_key(self)])
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """Choose the inputs among a dataset's features, and read the view's options and the workspace from them.
+
+        Raises:
+            ValueError: if the dataset lacks what the policy needs.
+        """
+        super().set_dataset_feature_metadata(features)
+        key = wrist_key(self)
+        if key is None or self.input_features is None:
+            return
+        shape = features.get(key, {}).get("shape")
+        if shape is None or features[key]["dtype"] not in ("image", "video") or shape[-1] != 3:
+            found = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+            raise ValueError(
+                f"--policy.wrist_camera={self.wrist_camera} needs the colour image {key!r}; the dataset has the images "
+                f"{sorted(found)}"
+            )
+        self.input_features[key] = PolicyFeature(FeatureType.VISUAL, (3, *shape[:2]))
 
     @property
     def trajectories(self) -> Trajectories:
@@ -77,3 +113,9 @@ class ChunkConfig(SymviewConfig):
     def action_delta_indices(self) -> list[int] | None:  # type: ignore[override]
         """The frames of a sample's actions, relative to the present one."""
         return None if self.horizon == 1 else list(range(self.horizon))
+
+
+def wrist_key(config: SymviewConfig) -> str | None:
+    """Return the feature with the image of the gripper's camera; None if the policy has none."""
+    camera = getattr(config, "wrist_camera", None)
+    return None if camera is None else keys.rgb(camera)

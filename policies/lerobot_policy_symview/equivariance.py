@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.configuration_chunks import wrist_key
 from lerobot_policy_symview.inputs.history import as_frames, as_history, history_length
 from lerobot_policy_symview.nn.layers import autocast_dtype
 from lerobot_policy_symview.policy import SymviewPolicy
@@ -139,6 +140,9 @@ def transform_observation(
         for key in filter(None, (config.color_key, config.height_key)):
             if key in observation:
                 transformed[key] = _transform_pixels(observation[key], group, element)
+    wrist = wrist_key(config)
+    if wrist in observation and group.reflects(element):
+        transformed[wrist] = observation[wrist].flip(-1)
     is_raw = config.is_computed and config.color_key not in observation
     if camera == "moves" or (camera is None and (config.sees_points or is_raw)):
         for name in (config.camera, *config.merged_cameras):
@@ -197,6 +201,9 @@ def example_observation(
         config.color_key: _blotches(batch, 3, side, generator).to(dtype),
         keys.STATE: state,
     }
+    wrist = wrist_key(config)
+    if wrist is not None:
+        observation[wrist] = _blotches(batch, 3, side, generator).to(dtype)[..., : side * 3 // 4, :]
     if config.modality == "rgbd" and config.height_key:
         depth = _blotches(batch, 1, side, generator).to(dtype)
         observation[config.height_key] = 0.7 + 0.2 * depth if not config.is_computed else 0.2 * depth

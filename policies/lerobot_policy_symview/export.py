@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_policy_symview.chunks import ChunkPolicy
+from lerobot_policy_symview.configuration_chunks import wrist_key
 from lerobot_policy_symview.policy import SymviewPolicy
 
 
@@ -55,7 +56,7 @@ def export_policy(policy: SymviewPolicy, observation: dict[str, Tensor]) -> torc
             f"{policy.config.n_obs_steps} and horizon={policy.config.horizon}"
         )
     # two samples, since torch.export takes a size of 1 for a constant
-    read = [*policy.scene.keys, *policy.scene.optional_keys]
+    read = [*policy.scene.keys, *policy.scene.optional_keys, wrist_key(policy.config)]
     example = {key: torch.cat([observation[key][:1]] * 2) for key in read if key in observation}
     batch = torch.export.Dim("batch")
     return torch.export.export(PolicyModule(policy), (example,), dynamic_shapes=[{key: {0: batch} for key in example}])

@@ -8,6 +8,7 @@ from typing import Any
 from huggingface_hub import ModelCard, ModelCardData
 
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.configuration_chunks import wrist_key
 
 TAGS = ("robotics", "lerobot", "symview", "equivariance")
 OBSERVATIONS = {
@@ -49,6 +50,7 @@ def model_card(
         datasets=[dataset],
         model_name=str(config.type),
     )
+    wrist = f", the image `{wrist_key(config)}` of a camera on the gripper" if wrist_key(config) else ""
     repository = config.repo_id or "user/name"
     observation = OBSERVATIONS.get(config.view.name, f"the view `{config.view.name}` of the camera `{{camera}}`")
     yaw = f"yaw as the representation `{config.theta_representation}`"
@@ -58,8 +60,8 @@ def model_card(
         f"A `{config.type}` policy of lerobot_symview, a LeRobot plugin; method `{config.method}`.\n",
         "## Inputs and outputs\n",
         f"The observation is {observation.format(camera=config.camera)} ({config.modality.upper()}, "
-        f"{config.crop_size} pixels), and the state. The network ({config.encoder} encoder, group {config.group}, "
-        f"width {config.width}, {parameters:,} parameters) is " + f"{_symmetry(config)}.\n",
+        f"{config.crop_size} pixels){wrist}, and the state. The network ({config.encoder} encoder, group "
+        f"{config.group}, width {config.width}, {parameters:,} parameters) is " + f"{_symmetry(config)}.\n",
         "| feature | representation of each dimension |\n|---|---|",
         f"| `observation.state` | {', '.join(config.state_symmetry)} |",
         f"| `action` | {', '.join(config.action_symmetry)}; {yaw} |\n",

@@ -26,6 +26,7 @@ from lerobot_policy_symview.inputs.feature_contract import read_calibration
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.inputs.state import StateInput
 from lerobot_policy_symview.model_card import model_card
+from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.processor_allowlist import check_processor_files
 from lerobot_policy_symview.processor_pipelines import changed_options
 from lerobot_policy_symview.processor_views import start_episodes
@@ -53,15 +54,14 @@ class Network(nn.Module):
 
     Args:
         config: the policy's configuration.
-        state_input: forms the state vector, the encoder's second input.
+        encoder: its group is the configuration's.
         make_head: makes the head.
     """
 
-    def __init__(self, config: SymviewConfig, state_input: StateInput, make_head: MakeHead):
+    def __init__(self, config: SymviewConfig, encoder: Encoder, make_head: MakeHead):
         super().__init__()
-        group = make_group(config.group)
-        self.encoder = make_encoder(config, group, state_input.representation(group))
-        self.head: Any = make_head(self.encoder.fields, config.actions.matrices(group, config.theta_representation))
+        self.encoder = encoder
+        self.head: Any = make_head(encoder.fields, config.actions.matrices(encoder.group, config.theta_representation))
 
     def forward(self, observation: Tensor, state: Tensor) -> Any:
         """Return the head's output for an observation and a state (B, D)."""
@@ -97,7 +97,7 @@ class SymviewPolicy(PreTrainedPolicy):
         self.workspace = parse_workspace(config.workspace)
         self.scene = make_scene_input(config, self.workspace)
         self.state_input = StateInput(config, self.workspace)
-        self.network = Network(config, self.state_input, make_head)
+        self.network = Network(config, self.make_encoder(), make_head)
         self.averaged = deepcopy(self.network).requires_grad_(False) if config.weight_averaging else None
         stats = dataset_stats or {}
         ranges = self._state_ranges(stats.get(keys.STATE))
@@ -145,6 +145,11 @@ class SymviewPolicy(PreTrainedPolicy):
             state_dict = {**state_dict, **initial}
         state_dict = with_reference(state_dict, self.reference_image if self.config.check_camera else None)
         return super().load_state_dict(state_dict, strict, assign)
+
+    def make_encoder(self) -> Encoder:
+        """Return the encoder of what `network_input` returns."""
+        group = make_group(self.config.group)
+        return make_encoder(self.config, group, self.state_input.representation(group))
 
     def action_scale(self, action: Stats | None, state: Stats | None) -> tuple[Tensor, Tensor]:
         """Return centre and half-width of the network's output for the ranges of actions and states in the dataset."""
@@ -255,7 +260,7 @@ class SymviewPolicy(PreTrainedPolicy):
 
     def network_input(
         self, batch: dict[str, Tensor], transform: PlanarTransform | None = None, crop_offset: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Any, Tensor]:
         """Return the network's input: the observation and the state (B, D).
 
         Args:
