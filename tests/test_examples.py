@@ -38,6 +38,11 @@ class Trial:
 
 
 TRIALS = {
+    "action_chunks": Trial(
+        "--demonstrations=1 --steps=1 --episodes=1 --output_dir={output}",
+        (r"(0|100) % of 1 episodes succeed",),
+        ("flow/checkpoints/last/pretrained_model/model.safetensors", "evaluation/eval_info.json"),
+    ),
     "add_views": Trial(
         "--dataset={recorded} --size=40 --output_dir={output}",
         (r"side_reproj +\(3, 40, 40\)", r"side_reproj_height +\(1, 40, 40\)", r"side_persp +\(3, 40, 40\)"),
