@@ -64,13 +64,17 @@ def test_a_resumed_training_goes_on_with_the_same_samples_and_state(with_views, 
 
 @pytest.mark.slow
 def test_two_processes_train_one_policy(with_views, tmp_path):
-    """`accelerate launch` on the CPU: the processes average their gradients and one writes the checkpoint."""
-    launch = "-m accelerate.commands.launch --cpu --num_machines=1 --num_processes=2 --mixed_precision=no"
+    """They average their gradients and one writes the checkpoint. `accelerate launch --cpu` would start one process."""
+    launch = "-m torch.distributed.run --standalone --nproc_per_node=2"
     options = f"--policy.device=cpu --policy.push_to_hub=false --dataset.repo_id=test/views --dataset.root={with_views}"
     sizes = f"--steps=2 --batch_size=2 --num_workers=0 --env_eval_freq=0 --output_dir={tmp_path / 'run'}"
-    command = f"{launch} --main_process_port=0 -m lerobot.scripts.lerobot_train {options} {sizes}".split()
+    command = f"{launch} -m lerobot.scripts.lerobot_train {options} {sizes}".split()
     done = subprocess.run(
-        [sys.executable, *command, *FLOW], capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        [sys.executable, *command, *FLOW],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "Effective batch size: 2 x 2 = 4" in done.stderr + done.stdout

@@ -18,6 +18,7 @@ from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
+from lerobot_symview.runtime.flag_errors import FlagError
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.helpers.training import train as lerobot_train
@@ -110,7 +111,7 @@ def test_augmented_samples_give_transformed_features():
 
 @pytest.mark.parametrize("camera", ["side", "left"])
 def test_the_camera_of_a_view_is_refused(camera):
-    with pytest.raises(ValueError, match=f"--policy.wrist_camera={camera} is a camera of the policy's view"):
+    with pytest.raises(FlagError, match=f"--policy.wrist_camera={camera} is a camera of the policy's view"):
         SymviewFlowConfig(view={"name": "reproj", "cameras": ["left"]}, wrist_camera=camera)
 
 
