@@ -55,7 +55,7 @@ class MotionScores:
 
 
 def motion_scores(
-    images: NDArray[np.uint8], points: NDArray[np.floating], camera: Camera, workspace: Workspace, group: PlanarGroup
+    images: NDArray[np.uint8], points: NDArray[np.float64], camera: Camera, workspace: Workspace, group: PlanarGroup
 ) -> Array | None:
     """Return how much more images change at the gripper than there at other times (G,); None if nothing moves.
 

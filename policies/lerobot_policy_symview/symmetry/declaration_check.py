@@ -57,8 +57,8 @@ class Motion:
     @cached_property
     def scale(self) -> Array:
         """(I + S,): root mean square of inputs and outputs; the dimensions of a vector share it."""
-        groups = [0, *(1 + np.array(self.actions.shared_scales))]
-        groups = np.array([*groups, *(groups[-1] + len(groups) + np.array(self.states.shared_scales))])
+        ones, actions, states = ([0], self.actions.shared_scales, self.states.shared_scales)
+        groups = np.concatenate([ones, 1 + np.array(actions), 1 + len(actions) + np.array(states)])
         power = np.diagonal(self._squares.sum(axis=0)) / sum(map(len, self.inputs))
         scale = np.sqrt([power[groups == group].mean() for group in groups])
         return np.where(scale > STILL, scale, np.inf)  # what does not move explains nothing
