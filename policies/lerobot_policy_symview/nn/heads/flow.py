@@ -99,7 +99,10 @@ class FlowHead(nn.Module):
         target = chunk.expand(samples, *chunk.shape)
         noise = torch.randn_like(target) if self.has_noise else torch.zeros_like(target)
         shape = (*target.shape[:2], 1, 1)
-        time = torch.rand(shape, device=chunk.device, dtype=chunk.dtype) if self.has_noise else target.new_zeros(shape)
+        time = target.new_zeros(shape)
+        if self.has_noise:  # a sample's times are spread, one in each of as many equal intervals
+            earliest = torch.arange(samples, device=chunk.device, dtype=chunk.dtype).view(-1, 1, 1, 1)
+            time = (earliest + torch.rand_like(time)) / samples
         times = self.denoiser.time_condition(time[..., 0])
         end = self._end(torch.lerp(noise, target, time), self.denoiser.condition(features), times)
         errors = (end - target).square().mean(dim=(0, 3))
