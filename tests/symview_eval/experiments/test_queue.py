@@ -75,6 +75,18 @@ def test_costs_are_medians_of_the_nearest_results(tmp_path):
     assert seconds("figure5", "block_picking", "oracle_equi") == 101.5  # wall-clock, its only time
 
 
+def test_costs_of_chunks_are_of_the_same_row(tmp_path):
+    cells = select(EXPERIMENTS["chunks"], LAPTOP, ["block_picking"], ["flow_reproj_equi", "act_reproj"], seeds=[0])
+    for cell, seconds in zip(cells, (300.0, 500.0), strict=True):
+        write_result(tmp_path / cell.path, replace(result(cell.configuration_hash), times=Times(cpu_s=seconds)))
+    costs = Costs.measured(finished_results(tmp_path, "laptop"))
+    assert [costs.seconds(cell) for cell in cells] == [300.0, 500.0]
+    (other,) = select(EXPERIMENTS["chunks"], LAPTOP, ["block_pushing"], ["act_reproj"], seeds=[0])
+    assert costs.seconds(other) == 500.0
+    (single,) = select(EXPERIMENTS["table1"], LAPTOP, ["block_picking"], ["reproj_equi"], [10], [0])
+    assert costs.seconds(single) is None
+
+
 def test_what_remains_counts_each_run_once():
     cells = all_cells(tasks=["block_stacking"], methods=["reproj_equi"], demos=[10], seeds=[0])
     assert [cell.experiment for cell in cells] == ["table1", "table3", "table4", "transfer", "robustness", "hidden"]
