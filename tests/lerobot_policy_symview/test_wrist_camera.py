@@ -173,4 +173,4 @@ def test_lerobot_trains_and_evaluates_with_the_simulators_camera(with_wrist, tmp
 @pytest.mark.parametrize("camera", ["hand", "side_reproj_height"])
 def test_a_dataset_without_the_colour_image_is_refused(camera, with_wrist, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=rf"--policy.wrist_camera={camera} needs the colour image .* has the images"):
-        lerobot_train(monkeypatch, with_wrist, tmp_path, policy=[*FLOW, f"--policy.wrist_camera={camera}"])
+        lerobot_train(monkeypatch, with_wrist, tmp_path / "policy", policy=[*FLOW, f"--policy.wrist_camera={camera}"])

@@ -123,7 +123,8 @@ def _ticks(policy: ChunkPolicy, chunks: int) -> dict[str, float]:
 def _observations(config: ChunkConfig) -> list[dict[str, Tensor]]:
     """Return successive observations of one robot, a batch of 1 each, as `lerobot-eval` gives them to policies."""
     camera = CameraSpec(config.camera, height=ROWS, width=COLUMNS)
-    env = EnvSettings(camera=camera, oracle=config.seen_camera == keys.ORACLE, control="fine").make()
+    oracle, wrist = config.seen_camera == keys.ORACLE, config.wrist_camera == keys.WRIST
+    env = EnvSettings(camera=camera, oracle=oracle, wrist_camera=wrist, control="fine").make()
     observation, _ = env.reset(seed=0)
     observations = []
     for _ in range(FRAMES):
