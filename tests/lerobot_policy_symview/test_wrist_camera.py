@@ -144,13 +144,15 @@ def with_wrist(tmp_path_factory):
     return add_views(config)
 
 
-FLOW = ("--policy.type=symview_flow", "--policy.width=16", "--policy.crop_size=64", "--policy.horizon=4")
-CHUNK = ("--policy.n_action_steps=2", "--policy.wrist_camera=wrist", "--policy.augmentation=d4")
+SIZES = ("--policy.type=symview_flow", "--policy.width=16", "--policy.crop_size=64")
+FLOW = (*SIZES, "--policy.horizon=4", "--policy.n_action_steps=2", "--policy.augmentation=d4")
 
 
 @pytest.mark.long
 def test_lerobot_trains_and_evaluates_with_the_simulators_camera(with_wrist, tmp_path, monkeypatch):
-    checkpoint = lerobot_train(monkeypatch, with_wrist, tmp_path / "policy", policy=[*FLOW, *CHUNK])
+    checkpoint = lerobot_train(
+        monkeypatch, with_wrist, tmp_path / "policy", policy=[*FLOW, "--policy.wrist_camera=wrist"]
+    )
     policy = SymviewFlowPolicy.from_pretrained(checkpoint)
     assert policy.config.input_features[WRIST].shape == (3, 96, 96)
     assert_equivariant(policy)
