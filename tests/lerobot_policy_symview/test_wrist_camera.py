@@ -165,8 +165,8 @@ def test_lerobot_trains_and_evaluates_with_the_simulators_camera(with_wrist, tmp
 
     monkeypatch.setattr(SymviewFlowPolicy, "network_input", recorded)
     command = f"lerobot-eval --policy.path={checkpoint} --policy.device=cpu --env.type=symview --env.max_steps=3"
-    options = f"--env.wrist_camera=true --eval.n_episodes=1 --eval.batch_size=1 --output_dir={tmp_path / 'eval'}"
-    monkeypatch.setattr(sys, "argv", [*command.split(), *options.split()])
+    size = f"--env.wrist_camera=true --eval.n_episodes=1 --eval.batch_size=1 --output_dir={tmp_path / 'eval'}"
+    monkeypatch.setattr(sys, "argv", [*command.split(), *size.split()])
     lerobot_eval.main()
     assert seen == [(2, 3, 96, 96)] * 2
 
