@@ -83,7 +83,9 @@ class Cell:
     @property
     def policy_type(self) -> str:
         """LeRobot's type of its policy."""
-        return self.row.chunks or ("symview_bc" if self.algorithm == "bc" else "symview_sacfd")
+        if self.chunks is not None:
+            return self.chunks.type
+        return "symview_bc" if self.algorithm == "bc" else "symview_sacfd"
 
     @property
     def policy_settings(self) -> dict[str, Any]:

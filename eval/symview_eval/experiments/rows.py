@@ -29,7 +29,7 @@ class MethodRow:
     longer: int = 1
     """Factor of the number of training steps."""
     chunks: str = ""
-    """Type of its policy of action chunks, a key of `Scale.chunks`; by default it is `symview_bc` with single actions,
+    """Kind of its policy of action chunks, a key of `Scale.chunks`; by default it is `symview_bc` with single actions,
     or in reinforcement learning `symview_sacfd`."""
 
     @property
@@ -79,7 +79,17 @@ def at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
     return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
 
 
-TRANSFERRED = (REPROJ, PERSP, BROKEN, SIDE, PLAIN, PLUCKER, VOXEL, CLOUD)
+def _in_chunks(chunks: str, name: str, label: str, method: str, longer: int = 1, **policy: Any) -> MethodRow:
+    """Return the row of a kind of policy that predicts chunks, with what a method sees."""
+    kind = {"symview_flow": "flow", "symview_bc": "regression"}.get(chunks, chunks)
+    return replace(method_row(f"{kind}_{name}", label, method, **policy), longer=longer, chunks=chunks)
+
+
+ACT = (
+    _in_chunks("act_single", "reproj", "ACT, reprojected view", "reproj_equi", modality="rgb"),
+    _in_chunks("act_single", "sideview", "ACT, side image", "sideview_equi", modality="rgb"),
+)
+TRANSFERRED = (REPROJ, PERSP, BROKEN, SIDE, PLAIN, PLUCKER, VOXEL, CLOUD, *ACT)
 ANYWHERE = CameraSpread(elevation_deg=20.0, azimuth_deg=180.0)
 PLACEMENTS = (
     ("training", CameraSpec()),
@@ -154,6 +164,7 @@ FOREIGN = (
     in_foreign_world(SIDE),
     in_foreign_world(PLAIN),
     in_foreign_world(method_row("sideview_equi_longer", "Sideview Equi, 5 x as many steps", "sideview_equi"), longer=5),
+    *(in_foreign_world(row) for row in ACT),
 )
 
 
@@ -161,12 +172,6 @@ CHUNKS_MOVED = (
     ("training", CameraSpec()),
     *((f"azimuth {azimuth:+d}°", CameraSpec(azimuth_deg=azimuth)) for azimuth in (-90, -45, 45, 90)),
 )
-
-
-def _in_chunks(chunks: str, name: str, label: str, method: str, longer: int = 1, **policy: Any) -> MethodRow:
-    """Return the row of a type of policy that predicts chunks, with what a method sees."""
-    kind = {"symview_flow": "flow", "symview_bc": "regression"}.get(chunks, chunks)
-    return replace(method_row(f"{kind}_{name}", label, method, **policy), longer=longer, chunks=chunks)
 
 
 CHUNKED = (

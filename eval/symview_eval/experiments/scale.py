@@ -10,10 +10,12 @@ Algorithm = Literal["bc", "sacfd"]
 
 @dataclass(frozen=True)
 class ChunkTraining:
-    """The training of one type of policy of action chunks."""
+    """The training of one kind of policy of action chunks."""
 
+    type: str
+    """LeRobot's type of the policy."""
     steps: int
-    """Training steps, twice as many for the harder tasks: of all types, they take about the same time."""
+    """Training steps, twice as many for the harder tasks: of all kinds, they take about the same time."""
     batch_size: int
     """Samples per training step."""
     policy: dict[str, Any] = field(hash=False)
@@ -69,7 +71,7 @@ class Scale:
     dtype: str = "float32"
     """Precision of convolutions."""
     chunks: dict[str, ChunkTraining] = field(default_factory=dict, hash=False, repr=False)
-    """Type of a policy of action chunks, ours or LeRobot's own -> its training."""
+    """Kind of a policy of action chunks, ours or LeRobot's own -> its training."""
 
     def policy(self, algorithm: Algorithm) -> dict[str, Any]:
         """Return the policy settings that the scale determines."""
@@ -84,32 +86,37 @@ class Scale:
 
 CHUNKS = {"n_obs_steps": 2, "horizon": 16, "n_action_steps": 8}
 ACT_CHUNKS = {"chunk_size": 16, "n_action_steps": 8}
+ACT_SINGLE = {"chunk_size": 4, "n_action_steps": 1}  # of coarse control, whose episodes have about 7 actions
 FROM_SCRATCH = {"pretrained_backbone_weights": None}
 PAPER = {"width": 64, "crop_size": 128, "dtype": "bfloat16"}
+PAPER_POLICIES: dict[str, dict[str, Any]] = {
+    "symview_flow": PAPER | CHUNKS,
+    "symview_bc": PAPER | CHUNKS,
+    "act": FROM_SCRATCH | ACT_CHUNKS,
+    "act_single": FROM_SCRATCH | ACT_SINGLE,
+    "diffusion": FROM_SCRATCH | CHUNKS | {"use_group_norm": True, "crop_shape": (128, 128)},
+}
 PAPER_CHUNKS = {
-    "symview_flow": ChunkTraining(5000, 128, PAPER | CHUNKS),
-    "symview_bc": ChunkTraining(5000, 128, PAPER | CHUNKS),
-    "act": ChunkTraining(5000, 128, FROM_SCRATCH | ACT_CHUNKS),
-    "diffusion": ChunkTraining(5000, 128, FROM_SCRATCH | CHUNKS | {"use_group_norm": True, "crop_shape": (128, 128)}),
+    kind: ChunkTraining(kind.removesuffix("_single"), 5000, 128, settings) for kind, settings in PAPER_POLICIES.items()
 }
 LAPTOP = {"width": 16, "crop_size": 64, "aperture_noise": 0.03, "weight_averaging": 0.99}
 LAPTOP_FLOW_STEPS, LAPTOP_BATCH = 2000, 8
 LAPTOP_STEP_MS = {"symview_flow": 88, "symview_bc": 70, "act": 320, "diffusion": 390}
-"""Processor time of a training step: all types are trained for the time of flow matching."""
+"""Processor time of a training step: all kinds are trained for the time of flow matching."""
+LAPTOP_ACT = FROM_SCRATCH | {
+    "dim_model": 128,
+    "n_heads": 4,
+    "dim_feedforward": 512,
+    "n_encoder_layers": 2,
+    "n_vae_encoder_layers": 2,
+    "optimizer_lr": 3e-4,
+    "optimizer_lr_backbone": 3e-4,
+}
 LAPTOP_POLICIES: dict[str, dict[str, Any]] = {
     "symview_flow": LAPTOP | CHUNKS,
     "symview_bc": LAPTOP | CHUNKS | {"learning_rate_decay": "cosine"},
-    "act": FROM_SCRATCH
-    | ACT_CHUNKS
-    | {
-        "dim_model": 128,
-        "n_heads": 4,
-        "dim_feedforward": 512,
-        "n_encoder_layers": 2,
-        "n_vae_encoder_layers": 2,
-        "optimizer_lr": 3e-4,
-        "optimizer_lr_backbone": 3e-4,
-    },
+    "act": LAPTOP_ACT | ACT_CHUNKS,
+    "act_single": LAPTOP_ACT | ACT_SINGLE,
     "diffusion": FROM_SCRATCH
     | CHUNKS
     | {
@@ -123,12 +130,16 @@ LAPTOP_POLICIES: dict[str, dict[str, Any]] = {
     },
 }
 """Sizes that fit two cores. ResNet-18 is the smallest encoder that ACT and Diffusion Policy have."""
-LAPTOP_CHUNKS = {
-    name: ChunkTraining(
-        LAPTOP_FLOW_STEPS * LAPTOP_STEP_MS["symview_flow"] // LAPTOP_STEP_MS[name], LAPTOP_BATCH, settings
-    )
-    for name, settings in LAPTOP_POLICIES.items()
-}
+
+
+def _laptop_chunks(kind: str, settings: dict[str, Any]) -> ChunkTraining:
+    """Return a training that takes as long as that of flow matching."""
+    name = kind.removesuffix("_single")
+    steps = LAPTOP_FLOW_STEPS * LAPTOP_STEP_MS["symview_flow"] // LAPTOP_STEP_MS[name]
+    return ChunkTraining(name, steps, LAPTOP_BATCH, settings)
+
+
+LAPTOP_CHUNKS = {kind: _laptop_chunks(kind, settings) for kind, settings in LAPTOP_POLICIES.items()}
 
 SCALES = {
     scale.name: scale
