@@ -182,8 +182,12 @@ CHUNKED = (
     _in_chunks("symview_bc", "reproj_equi", "Reproj. Equi, regression of chunks", "reproj_equi"),
     _in_chunks("act", "reproj", "ACT, reprojected view", "reproj_equi", modality="rgb"),
     _in_chunks("act", "sideview", "ACT, side image", "sideview_equi", modality="rgb"),
+    _in_chunks("act", "reproj_longer", "ACT, view, 5 x as many steps", "reproj_equi", longer=5, modality="rgb"),
     _in_chunks("diffusion", "reproj", "Diffusion Policy, reprojected view", "reproj_equi", modality="rgb"),
     _in_chunks("diffusion", "sideview", "Diffusion Policy, side image", "sideview_equi", modality="rgb"),
+    _in_chunks(
+        "diffusion", "reproj_longer", "Diffusion Policy, view, 5 x as many steps", "reproj_equi", longer=5, modality="rgb"
+    ),
 )
 
 

@@ -108,9 +108,9 @@ LAPTOP_ACT = FROM_SCRATCH | {
     "n_heads": 4,
     "dim_feedforward": 512,
     "n_encoder_layers": 2,
-    "n_vae_encoder_layers": 2,
-    "optimizer_lr": 3e-4,
-    "optimizer_lr_backbone": 3e-4,
+    "use_vae": False,
+    "optimizer_lr": 1e-4,
+    "optimizer_lr_backbone": 1e-4,
 }
 LAPTOP_POLICIES: dict[str, dict[str, Any]] = {
     "symview_flow": LAPTOP | CHUNKS,
