@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import pytest
 import torch
 from lerobot.scripts import lerobot_eval
@@ -13,6 +14,7 @@ from lerobot_policy_symview.inputs.history import as_history
 from lerobot_policy_symview.inputs.wrist import wrist_input
 from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.modeling_symview_flow import SymviewFlowPolicy
+from lerobot_policy_symview.rl.rollouts import Actor, simulator_config
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
@@ -20,7 +22,8 @@ from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.runtime.flag_errors import FlagError
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
-from symview_sim.settings import NewDataset
+from symview_sim.settings import EnvSettings, NewDataset
+from symview_sim.simulators import Reset, Simulators
 from tests.helpers.training import train as lerobot_train
 from tests.lerobot_policy_symview.test_modeling_symview_flow import make_chunk_policy, train
 
@@ -121,6 +124,18 @@ def test_observations_without_the_image_are_refused():
     del observation[WRIST]
     with pytest.raises(KeyError, match=r"--policy.wrist_camera=wrist needs observation\.images\.wrist, the obs"):
         policy.select_action(observation)
+
+
+def test_simulators_report_the_image():
+    policy = make_chunk_policy(wrist_camera="wrist")
+    with pytest.raises(ValueError, match=r"needs observation.images.wrist: --env.wrist_camera=true simulates"):
+        simulator_config(policy.config, EnvSettings("block_picking"))
+    config = simulator_config(policy.config, EnvSettings("block_picking", wrist_camera=True))
+    with Simulators(config, 1) as simulators:
+        simulators.send(0, Reset(0))
+        observation = simulators.receive(0).observation
+    assert observation[WRIST].shape == (96, 96, 3)
+    assert np.isfinite(Actor(policy)([observation])).all()
 
 
 def test_the_model_card_names_the_image():

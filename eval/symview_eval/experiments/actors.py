@@ -23,6 +23,9 @@ from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from symview_eval.experiments.grid import Cell
 
+SIGHT = "sight"
+"""Folder of a checkpoint with the configuration of what a policy of LeRobot's own sees."""
+
 
 class ForeignActor(Actor):
     """A policy of LeRobot's own, which sees the image that one of ours would see, at the same size, and the state.
@@ -114,11 +117,14 @@ def save_actor(actor: Actor, folder: Path) -> None:
     """Write a policy's checkpoint."""
     for saved in (actor.policy, actor.preprocessor, actor.postprocessor):
         saved.save_pretrained(folder)
+    if isinstance(actor, ForeignActor):
+        actor.scene.config.save_pretrained(folder / SIGHT)
 
 
-def load_actor(cell: Cell, folder: Path, device: str) -> Actor:
+def load_actor(cell: Cell, folder: Path) -> Actor:
     """Return a cell's trained policy from a checkpoint of `save_actor`."""
     policy: Any = get_policy_class(cell.policy_type).from_pretrained(folder)
     if is_ours(cell):
         return Actor(policy)
-    return ForeignActor(policy, make_pre_post_processors(policy.config, str(folder)), sight(cell, device))
+    processors = make_pre_post_processors(policy.config, str(folder))
+    return ForeignActor(policy, processors, cast(SymviewConfig, PreTrainedConfig.from_pretrained(folder / SIGHT)))

@@ -146,7 +146,7 @@ def _run(job: CellJob) -> None:
     elif cell.placements:
         if not job.policy.is_dir():
             _train(job, env)
-        checkpoints, times = evaluate_placements(cell, load_actor(cell, job.policy, job.device), env)
+        checkpoints, times = evaluate_placements(cell, load_actor(cell, job.policy), env)
     else:
         checkpoints, times = _train(job, env)
     origin = Origin(

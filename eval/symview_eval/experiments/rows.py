@@ -186,7 +186,12 @@ CHUNKED = (
     _in_chunks("diffusion", "reproj", "Diffusion Policy, reprojected view", "reproj_equi", modality="rgb"),
     _in_chunks("diffusion", "sideview", "Diffusion Policy, side image", "sideview_equi", modality="rgb"),
     _in_chunks(
-        "diffusion", "reproj_longer", "Diffusion Policy, view, 5 x as many steps", "reproj_equi", longer=5, modality="rgb"
+        "diffusion",
+        "reproj_longer",
+        "Diffusion Policy, view, 5 x as many steps",
+        "reproj_equi",
+        longer=5,
+        modality="rgb",
     ),
 )
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from lerobot_policy_symview.chunks import ChunkPolicy
 from lerobot_policy_symview.configuration import SymviewConfig
+from lerobot_policy_symview.configuration_chunks import wrist_key
 from lerobot_policy_symview.inputs.scene_input import make_scene_input
 from lerobot_policy_symview.policy import SymviewPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
@@ -100,9 +101,12 @@ def simulator_config(config: SymviewConfig, env: WorldSettings) -> SimulatorConf
     """Return the configuration of simulators of `env` whose observations have the features that a policy needs.
 
     Raises:
-        ValueError: if `config.state_symmetry` does not fit the simulators' state.
+        ValueError: if `config.state_symmetry` does not fit the simulators' state, or they have no camera on the gripper
+            and the policy needs it.
     """
-    names = env.state_names
+    names, wrist = env.state_names, wrist_key(config)
+    if wrist is not None and not (wrist == keys.rgb(keys.WRIST) and env.has_wrist_camera):
+        raise ValueError(f"the policy needs {wrist}: --env.wrist_camera=true simulates {keys.rgb(keys.WRIST)}")
     config.states.check(len(names), keys.STATE)
     if any(kind in names and kind != name for kind, name in zip(config.state_symmetry, names, strict=True)):
         raise ValueError(
@@ -111,7 +115,7 @@ def simulator_config(config: SymviewConfig, env: WorldSettings) -> SimulatorConf
         )
     return SimulatorConfig(
         env=env,
-        names=tuple(make_scene_input(config, parse_workspace(config.workspace)).keys),
+        names=(*make_scene_input(config, parse_workspace(config.workspace)).keys, *filter(None, [wrist])),
         views=tuple(config.views_to_make),
         camera=config.camera,
         workspace=config.workspace,

@@ -28,7 +28,7 @@ def test_a_copy_and_a_checkpoint_act_as_the_policy(row, recorded, tmp_path):
     assert set(observation) == set(actor.scene.keys)
     actions = actions_of(actor, [observation, observation])
     assert torch.allclose(actions_of(actor.copy(), [observation, observation]), actions)
-    assert torch.allclose(actions_of(load_actor(cell, tmp_path, "cpu"), [observation, observation]), actions)
+    assert torch.allclose(actions_of(load_actor(cell, tmp_path), [observation, observation]), actions)
 
 
 @pytest.mark.parametrize("row", ["act_sideview", "diffusion_reproj"])
