@@ -17,7 +17,7 @@ from lerobot_symview import keys
 from lerobot_symview.datasets.features import names_of
 from lerobot_symview.datasets.frame_reader import FrameReader
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset, vectors
-from lerobot_symview.errors import CalibrationError
+from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.geometry.state_reader import StateReader
 from symview_eval.declaration_words import described, kind_of, measured, problems
 from symview_eval.gripper_path import gripper_points
@@ -78,7 +78,10 @@ def check_declaration(
             return report
         _check_numbers(report, source, states, of_state, of_action, group)
     if reader is not None:
-        _check_images(report, reader, group)
+        try:
+            _check_images(report, reader, group)
+        except SymviewError as error:
+            report.facts.append(f"the images are not checked: {error}")
     return report
 
 
@@ -93,7 +96,16 @@ def _check_numbers(
     """Report how the state's motion follows from the actions."""
     count = len(source.episodes)
     episodes = np.unique(np.linspace(0, count - 1, min(count, MOST_EPISODES)).round().astype(int)).tolist()
-    recorded = [_vectors(source, episode) for episode in episodes]
+    recorded = []
+    for episode in episodes:
+        vectors_of_episode = _vectors(source, episode)
+        if all(np.isfinite(values).all() for values in vectors_of_episode):
+            recorded.append(vectors_of_episode)
+        else:
+            report.warnings.append(f"a state or an action of episode {episode} is not finite: the check leaves it out")
+    if len(recorded) < LEAST_EPISODES:
+        report.facts.append(f"not checked: {len(recorded)} episodes have finite states and actions")
+        return
     values = [reader.read(state) for state, _ in recorded], [action for _, action in recorded]
     longest = max(map(len, values[0]))
     window = int(np.clip(round(WINDOW * source.info["fps"]), 1, max(1, longest // 4)))
@@ -134,7 +146,7 @@ def _check_images(report: DeclarationReport, reader: FrameReader, group: PlanarG
             return
         shown = np.unique(np.linspace(0, len(points) - 1, SEEN_FRAMES).round().astype(int))
         table = EpisodeTables(reader.dataset, reader.dataset.data_file(episode), reader.columns()).read(episode)
-        frames = list(reader.frames(episode, table.take(shown)))
+        frames = [frame for index in shown for frame in reader.frames(episode, table.take([index]))]  # of a video too
         camera = frames[0].camera
         if any((frame.camera.world_from_cam != camera.world_from_cam).any() for frame in frames):
             continue

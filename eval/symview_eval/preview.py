@@ -183,6 +183,9 @@ def preview(config: PreviewConfig) -> Path:
     reader, views = _chosen(config, source)
     if (config.check or config.check_image) and reader is None:
         raise ValueError("--check and --check_image need the camera's images: the dataset has views only")
+    from symview_eval.declaration import check_declaration  # imports LeRobot, which takes seconds
+
+    declaration = check_declaration(source, reader, config.state_symmetry, config.action_symmetry)
     config.output_dir.mkdir(parents=True, exist_ok=True)
     recording = None
     if config.rerun and reader is not None:
@@ -211,9 +214,6 @@ def preview(config: PreviewConfig) -> Path:
     if recording is not None:
         recording.close()
     warnings = _warnings(config, views, reader.workspace, measured) if reader is not None else []
-    from symview_eval.declaration import check_declaration  # imports LeRobot, which takes seconds
-
-    declaration = check_declaration(source, reader, config.state_symmetry, config.action_symmetry)
     warnings += declaration.warnings
     for warning in warnings:
         logger.warning("%s", warning)

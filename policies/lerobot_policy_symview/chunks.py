@@ -31,7 +31,7 @@ class ChunkPolicy(SymviewPolicy):
     Args:
         config: the policy's configuration.
         make_head: makes the head on the features of all observations.
-        dataset_stats: minimum and maximum of states and actions in the dataset.
+        dataset_stats: minimum, maximum, mean and standard deviation of states and actions in the dataset.
     """
 
     config: ChunkConfig

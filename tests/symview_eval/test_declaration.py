@@ -196,6 +196,25 @@ def test_a_state_without_names_is_declared(arm, tmp_path):
     assert report.facts[0].startswith("x, y: the actions explain")
 
 
+def test_the_images_of_long_videos_are_checked(tmp_path):
+    (tmp_path / "cameras.yaml").write_text(CAMERAS)
+    source = HubDataset("test/arm", record_arm(tmp_path / "arm", 3, 160, use_videos=True))
+    arm = RobotFlags(preset="so101")
+    options = {"new_root": tmp_path / "ee", "calibration": tmp_path / "cameras.yaml"}
+    report = report_of(convert_actions(ConvertActionsConfig(source, arm, **options)), "front")
+    assert report.facts[-1] == "the images do not say whether the gripper is where the state says"  # they are noise
+
+
+def test_an_episode_that_is_not_finite_is_left_out_with_a_warning(arm, tmp_path):
+    def broken(state, action):
+        action[3, 0] = np.nan
+        return state, action
+
+    report = report_of(changed(arm, tmp_path / "nan", broken), "front")
+    assert "a state or an action of episode 0 is not finite: the check leaves it out" in report.warnings
+    assert report.facts[0].startswith("x, y: the actions explain")
+
+
 def test_too_few_episodes_are_not_checked(recorded):
     assert "not checked: 2 episodes, expected at least 3" in report_of(recorded, "side").facts
 

@@ -123,7 +123,11 @@ def _ticks(policy: ChunkPolicy, chunks: int) -> dict[str, float]:
 def _observations(config: ChunkConfig) -> list[dict[str, Tensor]]:
     """Return successive observations of one robot, a batch of 1 each, as `lerobot-eval` gives them to policies."""
     camera = CameraSpec(config.camera, height=ROWS, width=COLUMNS)
-    oracle, wrist = config.seen_camera == keys.ORACLE, config.wrist_camera == keys.WRIST
+    if config.wrist_camera not in (None, keys.WRIST):
+        raise ValueError(
+            f"--policy.wrist_camera={config.wrist_camera} is not simulated; the simulator's is {keys.WRIST}"
+        )
+    oracle, wrist = config.seen_camera == keys.ORACLE, config.wrist_camera is not None
     env = EnvSettings(camera=camera, oracle=oracle, wrist_camera=wrist, control="fine").make()
     observation, _ = env.reset(seed=0)
     observations = []
@@ -195,7 +199,7 @@ def _frames(policy: ChunkPolicy, count: int) -> dict[str, Tensor]:
 def _equivariance_error(policy: ChunkPolicy) -> float:
     """Return the largest error over the group elements that map pixels onto pixels, after a change of the weights.
 
-    At initialisation the velocity of flow matching is zero, which is trivially equivariant.
+    At initialisation the chunks of flow matching are zero, which is trivially equivariant.
     """
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():

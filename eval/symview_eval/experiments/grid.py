@@ -116,6 +116,7 @@ class Cell:
             "algorithm": self.algorithm,
             "policy": {**self.policy_settings, **self.row.policy},
             **({"chunks": self.row.chunks} if self.row.chunks else {}),
+            **({} if self.policy_type.startswith("symview_") else {"sight": self.scale.crop_size}),
             **({"world": self.world} if self.world else {}),
             "elevation_deg": camera.elevation_deg,
             **({"placed": [camera.azimuth_deg, camera.distance]} if _is_placed(camera) else {}),

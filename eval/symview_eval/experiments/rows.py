@@ -76,7 +76,8 @@ def _miscalibrated(**errors: float) -> CameraSpec:
 def at_elevation(row: MethodRow, elevation_deg: float) -> MethodRow:
     """Return the row with demonstrations by a camera at an elevation."""
     camera = CameraSpec(elevation_deg=elevation_deg)
-    return MethodRow(f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°", row.policy, camera)
+    name, label = f"{row.name}_{elevation_deg:g}deg", f"{row.label}, {elevation_deg:g}°"
+    return replace(row, name=name, label=label, camera=camera)
 
 
 def _in_chunks(chunks: str, name: str, label: str, method: str, longer: int = 1, **policy: Any) -> MethodRow:
@@ -135,7 +136,8 @@ def seeing_more(name: str, label: str, *cameras: CameraSpec, arm: bool = True, m
 def with_varying_camera(row: MethodRow) -> MethodRow:
     """Return the row with demonstrations by a new camera in every episode."""
     camera = CameraSpec(spread=ANYWHERE)
-    return MethodRow(f"{row.name}_varying", f"{row.label}, trained with many cameras", row.policy, camera)
+    name, label = f"{row.name}_varying", f"{row.label}, trained with many cameras"
+    return replace(row, name=name, label=label, camera=camera)
 
 
 FOREIGN_CAMERA = CameraSpec(azimuth_deg=60.0, distance=1.0)

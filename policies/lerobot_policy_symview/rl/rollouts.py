@@ -47,8 +47,10 @@ class Actor:
 
     @property
     def remembers(self) -> bool:
-        """Whether an action depends on earlier observations of the episode, or was planned with them."""
-        return isinstance(self.policy, ChunkPolicy) and not self.policy.config.is_reactive
+        """Whether an action depends on earlier observations of the episode, was planned with them, or is drawn."""
+        if not isinstance(self.policy, ChunkPolicy):
+            return False
+        return self.policy.has_noise or not self.policy.config.is_reactive
 
     def copy(self) -> Actor:
         """Return an actor with a copy of the policy as it is now."""

@@ -150,7 +150,7 @@ def motion(
 
 
 def consistency(moved: Motion, group: PlanarGroup, seed: int = 0) -> list[Consistency]:
-    """Return how far the motion contradicts the types, for each vector and scalar of the state that moves.
+    """Return how far the motion contradicts the types, for each vector and scalar of the state that often moves.
 
     Args:
         moved: actions and the motion after them.
@@ -166,11 +166,13 @@ def consistency(moved: Motion, group: PlanarGroup, seed: int = 0) -> list[Consis
     drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
     drawn = drawn[(drawn == 0).any(axis=1)]
     seen, held_out = (np.tensordot(weights, moved.products, 1) for weights in (drawn, 1.0 * (drawn == 0)))
-    return [
-        _consistency(moved, rows, group, seen, held_out)
-        for rows in _blocks(moved.states)
-        if np.isfinite(moved.scale[moved.inputs[0].shape[1] + rows[0]])
-    ]
+    found = []
+    for rows in _blocks(moved.states):
+        outputs = [moved.inputs[0].shape[1] + row for row in rows]
+        moves = np.trace(held_out[:, outputs][:, :, outputs], axis1=1, axis2=2) > STILL
+        if np.isfinite(moved.scale[outputs[0]]) and moves.mean() > 0.5:
+            found.append(_consistency(moved, rows, group, seen[moves], held_out[moves]))
+    return found
 
 
 def _consistency(moved: Motion, rows: list[int], group: PlanarGroup, seen: Array, held_out: Array) -> Consistency:

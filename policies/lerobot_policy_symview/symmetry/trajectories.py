@@ -109,6 +109,9 @@ class Trajectories:
 
         Returns:
             (A,) each if H is 1, else (H, A) each.
+
+        Raises:
+            ValueError: if chunks of increments lack a statistic.
         """
         low, high = (torch.as_tensor(action[end], dtype=torch.float32) for end in ("min", "max"))
         center, width = self.actions.scale(low, high)
@@ -121,6 +124,8 @@ class Trajectories:
             reach[yaws] = reach[yaws].clamp(max=math.pi)
             moving = reach.expand(horizon, -1)
         else:
+            if lacking := {"mean", "std"} - set(action):
+                raise ValueError(f"chunks of actions need their {' and '.join(sorted(lacking))}, got {sorted(action)}")
             mean, deviation = (torch.as_tensor(action[name], dtype=torch.float32) for name in ("mean", "std"))
             moving = torch.arange(1, horizon + 1)[:, None] * self._shared(torch.hypot(mean, deviation))
         moving = torch.where(moving > SMALLEST_EXTENT, moving, 1.0)

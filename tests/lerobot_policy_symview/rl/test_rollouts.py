@@ -146,9 +146,10 @@ def test_random_actions_follow_from_the_seeds_and_leave_the_random_numbers_of_a_
         (SymviewBcPolicy, SymviewBcConfig, CHUNKS, True),
         (SymviewBcPolicy, SymviewBcConfig, CHUNKS | {"horizon": 1, "n_action_steps": 1}, True),
         (SymviewFlowPolicy, SymviewFlowConfig, CHUNKS, True),
+        (SymviewFlowPolicy, SymviewFlowConfig, {"n_obs_steps": 1, "horizon": 1, "n_action_steps": 1}, True),
     ],
 )
-def test_policies_with_a_history_or_chunks_remember(policy_class, config_class, options, remembers):
+def test_policies_with_a_history_chunks_or_noise_remember(policy_class, config_class, options, remembers):
     assert Actor(policy_class(make_config(config_class, **options), STATS)).remembers == remembers
 
 

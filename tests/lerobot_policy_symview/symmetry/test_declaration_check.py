@@ -145,6 +145,16 @@ def test_actions_that_do_not_move_the_state_say_nothing():
     assert not any(result.is_known or result.is_contradicted for result in found.values() if result.labels[0] == "x")
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_dimension_that_moves_in_one_episode_is_left_out():
+    states, actions = demonstrations(0.0)
+    for state, action in zip(states[1:], actions[1:], strict=True):
+        state[:, 2], action[:, 2] = 0.1, 0.0
+    found = results(states, actions)
+    assert "z" not in found
+    assert found["x"].explained > 0.8
+
+
 def test_dimensions_that_always_move_alike_contradict_nothing():
     """Demonstrations along one diagonal: x and y cannot be told apart."""
     states, actions = demonstrations()

@@ -78,6 +78,12 @@ def test_scales_grow_with_time():
     torch.testing.assert_close(center[3], torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5]))
 
 
+def test_chunks_of_increments_need_their_statistics():
+    ends = {"min": -torch.ones(5), "max": torch.ones(5)}
+    with pytest.raises(ValueError, match=r"chunks of actions need their mean and std, got \['max', 'min'\]"):
+        Trajectories(POSE, POSE).scale(ends, None, horizon=2)
+
+
 def test_trajectories_of_smooth_motions_have_the_size_of_the_noise():
     actions = torch.randn(1, 5, dtype=torch.float64) * torch.ones(8, 16, 1, dtype=torch.float64)
     stats = {"min": -torch.ones(5), "max": torch.ones(5), "mean": actions.mean((0, 1)), "std": actions.std((0, 1))}

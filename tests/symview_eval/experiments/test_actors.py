@@ -21,13 +21,21 @@ def actions_of(actor, observations):
 def test_a_copy_and_a_checkpoint_act_as_the_policy(row, recorded, tmp_path):
     cell, (_, actor) = smoke_cell(row), dataset_and_actor(recorded, row)
     assert isinstance(actor, ForeignActor) != is_ours(cell)
+    with torch.no_grad():
+        for parameter in actor.policy.parameters():  # untrained, some policies do not move at all
+            parameter.add_(0.02 * torch.randn_like(parameter))
     save_actor(actor, tmp_path)
     with Simulators(simulator_config(actor.scene.config, EnvSettings("block_picking")), 1) as simulators:
         simulators.send(0, Reset(0))
         observation = simulators.receive(0).observation
     assert set(observation) == set(actor.scene.keys)
     actions = actions_of(actor, [observation, observation])
-    assert torch.allclose(actions_of(actor.copy(), [observation, observation]), actions)
+    copy = actor.copy()
+    with torch.no_grad():
+        for parameter in actor.policy.parameters():
+            parameter.zero_()
+    assert not torch.allclose(actions_of(actor, [observation, observation]), actions)
+    assert torch.allclose(actions_of(copy, [observation, observation]), actions)
     assert torch.allclose(actions_of(load_actor(cell, tmp_path), [observation, observation]), actions)
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
@@ -35,6 +37,20 @@ def test_every_row_configures_a_policy(name, scale):
             options = policy.views_to_make[0].options
             assert options["size"] == policy.image_size
             assert row.policy.get("view_options", {}).items() <= options.items()
+
+
+@pytest.mark.parametrize("cell", cells("transfer", seeds=[0], tasks=["block_picking"]), ids=lambda cell: cell.row.name)
+def test_a_varying_camera_changes_nothing_else_of_a_row(cell):
+    varying = single_cell("transfer", "block_picking", f"{cell.row.name.removesuffix('_varying')}_varying")
+    assert varying.row.camera.varies
+    assert (varying.policy_type, varying.steps) == (cell.policy_type, cell.steps)
+    assert varying.row.policy == cell.row.policy
+
+
+def test_what_lerobots_policies_see_is_part_of_their_configuration():
+    (cell,) = cells("chunks", methods=["act_reproj"], tasks=["block_picking"], seeds=[0], demos=[25])
+    larger = replace(cell, scale=replace(cell.scale, crop_size=128))
+    assert larger.configuration_hash != cell.configuration_hash
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
