@@ -29,6 +29,9 @@ class RobotFlags:
     """The arm's MJCF, in place of a URDF, with its meshes; MuJoCo reads it (extra so101, metaworld or fetch)."""
     tool_frame: str | None = None
     """Link, or an MJCF's body or site, between the finger tips, such as gripper_frame_link; by default the preset's."""
+    tool_offset: float | None = None
+    """Metres from that frame, in the direction in which the gripper opens, to the middle between the fingers; by
+    default the preset's, 0.03 for so101, whose frame is on the finger that does not move, else 0."""
     approach: str = "z"
     """Axis of that frame in which the fingers point: x, y, z, -x, -y or -z."""
     opening: str | None = None
@@ -85,7 +88,8 @@ class RobotFlags:
             if not names:
                 raise KinematicsError(f"the {kind}'s dimensions have no names, by which joints are matched")
         gripper = self.joints.get(self.gripper, preset.gripper if preset else self.gripper)
-        model = arm_chain(tree, tool_frame, self.approach, self.opening, gripper)
+        offset_of_tool = self.tool_offset if self.tool_offset is not None else preset.tool_offset if preset else 0.0
+        model = arm_chain(tree, tool_frame, self.approach, self.opening, gripper, offset_of_tool)
         robots_name = self._matched(model.names, [bare_name(name) for name in states], tree)
         joints = tuple(robots_name[name] for name in model.names)
         scale, offset = joint_scales(model, joints, self.units, self.motors, self.signs, self.offsets)

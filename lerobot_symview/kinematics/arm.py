@@ -107,9 +107,10 @@ class Arm:
         from scipy.spatial.transform import Rotation
 
         base_from_tool = self.model.forward(self._positions(actions, "action"))
-        turned = Rotation.from_matrix(base_from_tool[:, :3, :3] @ self.model.frame_from_tool.T).as_rotvec()
+        base_from_frame = base_from_tool @ np.linalg.inv(self.model.frame_from_tool)
+        turned = Rotation.from_matrix(base_from_frame[:, :3, :3]).as_rotvec()
         opening = 100.0 * self._aperture(actions, "action")
-        return np.concatenate([base_from_tool[:, :3, 3], turned, opening[:, None]], axis=1)
+        return np.concatenate([base_from_frame[:, :3, 3], turned, opening[:, None]], axis=1)
 
     def actions(self, positions: NDArray[np.floating], aperture: NDArray[np.floating]) -> Array:
         """Return a robot's actions (N, W) that ask for joint positions (N, J) and apertures (N,) in [0, 1]."""

@@ -81,7 +81,12 @@ class FrameTree:
 
 
 def arm_chain(
-    tree: FrameTree, tool_frame: str, approach: str = "z", opening: str | None = None, gripper: str | None = None
+    tree: FrameTree,
+    tool_frame: str,
+    approach: str = "z",
+    opening: str | None = None,
+    gripper: str | None = None,
+    tool_offset: float = 0.0,
 ) -> ArmModel:
     """Return the arm from the root of a model to a frame of it.
 
@@ -92,6 +97,8 @@ def arm_chain(
         opening: its axis along which the fingers open; by default, of `gripper`: the direction of a prismatic joint,
             and the one that a revolute joint moves a finger in.
         gripper: joint of the gripper.
+        tool_offset: metres from that frame, in the direction in which the gripper opens, to the middle between the
+            fingers, which is the tool.
 
     Raises:
         KinematicsError: if a name is unknown, a joint mimics another one, or the fingers' directions are unknown.
@@ -120,7 +127,8 @@ def arm_chain(
     sidewards /= np.linalg.norm(sidewards)
     axes = np.eye(4)
     axes[:3, :3] = np.stack([sidewards, np.cross(forwards, sidewards), forwards], axis=1)
-    return replace(arm, last_from_tool=pending @ axes, frame_from_tool=axes[:3, :3])
+    axes[:3, 3] = tool_offset * sidewards
+    return replace(arm, last_from_tool=pending @ axes, frame_from_tool=axes)
 
 
 def _opening(tree: FrameTree, tool_path: list[Edge], gripper: str | None, approach: Array) -> Array:

