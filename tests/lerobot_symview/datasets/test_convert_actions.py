@@ -101,7 +101,7 @@ def test_targets_are_those_of_lerobots_end_effector(recorded_arm, cameras_file, 
     info = read_info(folder)["features"][keys.ACTION]
     assert info["names"] == ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"]
     action = columns_of(folder, keys.ACTION)[0]
-    places, matrices = mujoco_places(np.deg2rad(joints()[1][:, :5]))
+    places, matrices = mujoco_places(np.deg2rad(joints()[1][:, :5]), offset=0.0)  # of the model's own frame
     np.testing.assert_allclose(action[:, :3], places, atol=1e-4)
     frames = Rotation.from_rotvec(action[:, 3:6]).as_matrix()
     np.testing.assert_allclose(frames[:, :, 2], matrices[:, :, 0], atol=1e-4)  # the URDF's frame points along z
@@ -206,8 +206,12 @@ def test_an_interrupted_run_is_resumed_and_workers_change_nothing(recorded_arm, 
             lambda values: values * [1, 1, -1, 1, 1, 1] - [0, 0, 0, 0, 90, 0],
         ),
         ({"gripper_range": (1, 0)}, NAMES, lambda v: np.append(v[:5], 1 - v[5] / 100)),
-        ({"preset": None, "urdf": SO101, "tool_frame": "gripper_frame_link"}, NAMES, None),
-        ({"preset": None, "mjcf": SO101_MJCF, "tool_frame": "gripperframe", "approach": "x"}, NAMES, None),
+        ({"preset": None, "urdf": SO101, "tool_frame": "gripper_frame_link", "tool_offset": 0.03}, NAMES, None),
+        (
+            {"preset": None, "mjcf": SO101_MJCF, "tool_frame": "gripperframe", "approach": "x", "tool_offset": 0.03},
+            NAMES,
+            None,
+        ),
         (
             {"joints": dict(zip("abcdef", [*JOINTS, "gripper"], strict=True)), "gripper": "f"},
             ("a", "b", "c", "d", "e", "f"),

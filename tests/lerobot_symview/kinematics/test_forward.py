@@ -5,7 +5,17 @@ import pytest
 
 from lerobot_symview.errors import KinematicsError
 from lerobot_symview.kinematics import ArmModel, arm_chain, model_from_plain, read_mjcf, read_urdf
-from tests.helpers.arms import PANDA, SO101, SO101_MJCF, bullet_places, mujoco_places, panda, random_positions, so101
+from tests.helpers.arms import (
+    PANDA,
+    SO101,
+    SO101_MJCF,
+    TOOL_OFFSET,
+    bullet_places,
+    mujoco_places,
+    panda,
+    random_positions,
+    so101,
+)
 
 TENTH_OF_A_MILLIMETRE = 1e-4
 
@@ -15,7 +25,7 @@ def angle_between(first, second):
 
 
 def so101_mjcf():
-    return arm_chain(read_mjcf(SO101_MJCF), "gripperframe", "x", gripper="gripper")
+    return arm_chain(read_mjcf(SO101_MJCF), "gripperframe", "x", gripper="gripper", tool_offset=TOOL_OFFSET)
 
 
 @pytest.mark.parametrize("make", [so101, so101_mjcf])
