@@ -14,6 +14,8 @@ import pytest
 
 from symview_sim.settings import EnvSettings
 from tests.helpers.packages import temporary_registrations
+from tests.helpers.so101 import convert, record, view
+from tests.helpers.training import train
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 
@@ -30,7 +32,7 @@ class Trial:
     """How an example is run, and its expected results."""
 
     arguments: str
-    """Its command line, with the folders `recorded`, `with_views` and `output`."""
+    """Its command line, with the folders `recorded`, `with_views`, `joints_policy` and `output`."""
     log_lines: tuple[str, ...]
     """Regular expressions of lines that it logs."""
     files: tuple[str, ...] = ()
@@ -90,6 +92,15 @@ TRIALS = {
         ("^step,success,return$", r"^1,[01]\.0,", r"the policy is in .*000001/pretrained_model$"),
         ("sacfd/checkpoints/last/pretrained_model/model.safetensors", "sacfd/training.csv"),
     ),
+    "so101_record": Trial(
+        "--episodes=2 --root={output}/so101",
+        ("episode 1: the cube is lifted", r"\d+ frames in .*so101$"),
+        ("so101/meta/info.json",),
+    ),
+    "so101_rollouts": Trial(
+        "--policy={joints_policy} --scenes=1 --seconds=0.2",
+        ("scene 100000: failed, 0 so far", "0 of 1 cubes are lifted"),
+    ),
     "stock_policy_on_views": Trial(
         "--demonstrations=1 --steps=1 --episodes=1 --output_dir={output}",
         (r"ACT succeeds in \d+ % of 1 episodes",),
@@ -124,11 +135,20 @@ def isolated_registrations_and_loggers():
 
 
 @pytest.fixture
-def run(recorded, with_views, tmp_path, monkeypatch, caplog, isolated_registrations_and_loggers):
+def joints_policy(tmp_path, monkeypatch):
+    """A checkpoint of the simulated arm."""
+    return train(monkeypatch, view(convert(record(monkeypatch, tmp_path / "so101"))), tmp_path / "run")
+
+
+@pytest.fixture
+def run(request, recorded, with_views, tmp_path, monkeypatch, caplog, isolated_registrations_and_loggers):
     """Return a function that runs an example and returns its log messages."""
 
     def run(name, arguments):
-        command_line = arguments.format(recorded=recorded, with_views=with_views, output=tmp_path)
+        folders = {"recorded": recorded, "with_views": with_views, "output": tmp_path}
+        if "{joints_policy}" in arguments:
+            folders["joints_policy"] = request.getfixturevalue("joints_policy")
+        command_line = arguments.format(**folders)
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *command_line.split()])
         caplog.set_level(logging.INFO, "__main__")
         example_logger = logging.getLogger("__main__")

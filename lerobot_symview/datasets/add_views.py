@@ -303,7 +303,9 @@ def _check_first_frame(derivation: ViewDerivation, source: SourceDataset) -> Non
 
 def _description(config: AddViewsConfig, derivation: ViewDerivation) -> dict[str, Any]:
     """Return all settings that determine the result, and those of earlier views that say how to read it."""
-    earlier = derivation.open_source().added_views
+    source = derivation.open_source()
+    earlier = source.added_views
+    left_out = {key: image_size(source.features, key) for key in derivation.dropped}
     return plain(
         {
             "repo_id": config.target().repo_id,
@@ -318,6 +320,7 @@ def _description(config: AddViewsConfig, derivation: ViewDerivation) -> dict[str
             "depth_units": derivation.depth_units,
             "state_origin": derivation.state_origin or earlier.get("state_origin"),
             "left_out": derivation.dropped,
+            "image_sizes": earlier.get("image_sizes", {}) | left_out,
             "symview": version("lerobot_policy_symview"),
         }
     )

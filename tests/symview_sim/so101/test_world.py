@@ -1,7 +1,5 @@
 """The simulated SO-101: its motors, its camera against the known cube, and the expert."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import yaml
@@ -11,8 +9,8 @@ from lerobot_symview.geometry.camera import invert_rigid, project, transform, un
 from symview_sim.so101.expert import So101Expert
 from symview_sim.so101.world import CAMERA, HALF_CUBE, OPEN, WORKSPACE, WORLD_FROM_BASE, So101World
 from tests.helpers.arms import so101
+from tests.helpers.so101 import CAMERAS
 
-CALIBRATION = Path(__file__).parents[3] / "examples" / "so101_cameras.yaml"
 AWAY = np.array([-100.0, -46.0, 26.0, 74.0, 0.0, OPEN])
 
 
@@ -61,8 +59,8 @@ def test_the_camera_sees_the_cube_where_it_is(world, seed):
     assert np.abs(inside - HALF_CUBE).max() < 0.001  # on the cube's surface
 
 
-def test_the_calibration_file_has_the_camera_the_base_and_the_workspace():
-    calibration = parse_calibration(yaml.safe_load(CALIBRATION.read_text()))  # in the axes of the base
+def test_the_calibration_of_the_page_has_the_camera_the_base_and_the_workspace():
+    calibration = parse_calibration(yaml.safe_load(CAMERAS))  # in the axes of the base
     camera = calibration.camera("side")
     np.testing.assert_allclose(camera.intrinsics, CAMERA.intrinsics, atol=1e-4)
     np.testing.assert_allclose(camera.world_from_cam, invert_rigid(WORLD_FROM_BASE) @ CAMERA.world_from_cam, atol=1e-5)
