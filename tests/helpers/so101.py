@@ -2,8 +2,9 @@
 
 import re
 import runpy
-import sys
 from pathlib import Path
+
+from lerobot.scripts import lerobot_record
 
 from lerobot_symview.datasets.add_views import AddViewsConfig, add_views
 from lerobot_symview.datasets.convert_actions import ConvertActionsConfig, convert_actions
@@ -16,15 +17,15 @@ CAMERAS = re.search(r"^```yaml\n(# cameras.yaml\n.*?)^```$", PAGE, re.MULTILINE 
 """The calibration of the simulated camera, as the page has it."""
 
 
-def run_example(monkeypatch, name, *arguments):
-    """Run a script of `examples`, and return its names."""
-    monkeypatch.setattr(sys, "argv", [name, *arguments])
-    return runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+def load_example(name):
+    """Return the names of a script of `examples`."""
+    return runpy.run_path(str(ROOT / "examples" / f"{name}.py"))
 
 
 def record(monkeypatch, folder, episodes=2):
     """Record demonstrations in joints, and return their folder."""
-    run_example(monkeypatch, "so101_record", f"--root={folder}", f"--episodes={episodes}")
+    monkeypatch.setattr(lerobot_record, "precise_sleep", lerobot_record.precise_sleep)  # which the example replaces
+    load_example("so101_record")["main"]("test/joints", folder, episodes, seed=0)
     return folder
 
 
