@@ -39,8 +39,10 @@ class So101Sim(Robot):
     @property
     def observation_features(self) -> dict[str, type | tuple[int, ...]]:
         """Names of what is observed: joints, and the camera's images by their shapes."""
-        size = (CAMERA.height, CAMERA.width)
-        return dict.fromkeys(NAMES, float) | {"side": (*size, 3), "side_depth": (*size, 1)}
+        height, width = CAMERA.height, CAMERA.width
+        features: dict[str, type | tuple[int, ...]] = dict.fromkeys(NAMES, float)
+        features |= {"side": (height, width, 3), "side_depth": (height, width, 1)}
+        return features
 
     @property
     def action_features(self) -> dict[str, type]:
