@@ -48,7 +48,8 @@ class So101Expert:
         if self._world.is_gripped():
             goal[:3] = [*pose[:2], RAISED]
             return goal, 0.0
-        if distance < NEAR and abs(turn) < ALIGNED:
+        is_open = self._world.joints()[5] > OPEN - 10 or pose[2] < GRASP + 0.02  # in which it may close again
+        if distance < NEAR and abs(turn) < ALIGNED and is_open:
             goal[2] = GRASP
             if pose[2] < GRASP + 0.006:
                 return goal, 0.0

@@ -70,7 +70,7 @@ class So101World:
         self._mujoco.mj_resetData(self.model, self.data)
         height = 0.0
         while not HEIGHTS[0] < height < HEIGHTS[1]:
-            joints = np.append(HOME + rng.uniform(-1, 1, 5) * HOME_SPREAD, OPEN)
+            joints = np.append(HOME + rng.uniform(-1, 1, 5) * HOME_SPREAD, rng.uniform(0.0, OPEN))
             self.data.qpos[:6] = self.data.ctrl[:6] = self._radians(joints)
             self._mujoco.mj_kinematics(self.model, self.data)
             height = self.data.site("gripperframe").xpos[2]
