@@ -1,6 +1,6 @@
 """Record demonstrations of a simulated SO-101 in joints, by the loop of `lerobot-record`.
 
-    python examples/so101_record.py --episodes=40
+    python examples/so101_record.py --episodes=80
 
 A scripted expert takes the place of the leader arm. The robot is `--robot.type=so101_sim` of LeRobot's commands.
 """
@@ -49,7 +49,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repo_id", default="me/so101")
     parser.add_argument("--root", type=Path, help="folder of the dataset; by default in LeRobot's cache")
-    parser.add_argument("--episodes", type=int, default=40)
+    parser.add_argument("--episodes", type=int, default=80)
     parser.add_argument("--seed", type=int, default=0, help="scene of the first episode")
     logging.basicConfig(level=logging.ERROR, format="%(message)s", force=True)
     logger.setLevel(logging.INFO)

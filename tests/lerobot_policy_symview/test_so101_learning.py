@@ -12,7 +12,7 @@ from tests.helpers.so101 import convert, load_example, record, view
 @pytest.mark.usefixtures("unchecked_kernels")
 def test_a_policy_learns_from_joints_to_lift_cubes_with_joints(tmp_path, monkeypatch):
     """docs/own_robot.md has the measured success rates."""
-    views = view(convert(record(monkeypatch, tmp_path / "joints", episodes=60)))
+    views = view(convert(record(monkeypatch, tmp_path / "joints", episodes=80)))
     command = [
         "lerobot-train",
         "--dataset.repo_id=test/views",
