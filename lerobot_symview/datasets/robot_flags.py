@@ -33,7 +33,7 @@ class RobotFlags:
     """Link, or an MJCF's body or site, between the finger tips, such as gripper_frame_link; by default the preset's."""
     tool_offset: float | None = None
     """Metres from that frame, in the direction in which the gripper opens, to the middle between the fingers; by
-    default the preset's, 0.03 for so101, whose frame is on the finger that does not move, else 0."""
+    default the preset's, 0.04 for so101, whose frame is on the finger that does not move, else 0."""
     approach: str = "z"
     """Axis of that frame in which the fingers point: x, y, z, -x, -y or -z."""
     opening: str | None = None

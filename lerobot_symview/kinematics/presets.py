@@ -51,7 +51,7 @@ PRESETS = {
         "assets/so101_new_calib.urdf",
         "gripper_frame_link",  # on the finger that does not move
         gripper="gripper",
-        tool_offset=0.03,
+        tool_offset=0.04,
     ),
     "panda": Preset(
         "pybullet_data", "sim", "franka_panda/panda.urdf", "panda_grasptarget", gripper="panda_finger_joint1"
