@@ -8,6 +8,7 @@ assert_equivariant(policy)
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Any, Literal
 
 import torch
@@ -49,7 +50,7 @@ def assert_equivariant(
 
     Args:
         policy: its mode is kept unchanged.
-        processors: its pre- and postprocessor; by default those of its configuration.
+        processors: its pre- and postprocessor; by default its configuration's for gripper poses, not for joints.
         observation: a batch from an environment or dataset; by default `example_observation`.
         camera: whether the camera moves with the scene; by default it does where its image is made into the policy's
             view or lifted to points in space, and stays where the observation has the view already.
@@ -86,7 +87,7 @@ def equivariance_errors(
     `assert_equivariant`.
     """
     config = policy.config
-    preprocess, postprocess = processors or make_processors(config)
+    preprocess, postprocess = processors or make_processors(_without_arm(config))
     if observation is None:
         history = policy.history_length
         raw = example_observation(config, policy.action_center.dtype, batch=EXAMPLES * history)
@@ -119,6 +120,13 @@ def equivariance_errors(
         errors[element] = float(((actual - expected).abs().amax(dim=0) / scale).max())
     policy.train(training)
     return errors
+
+
+def _without_arm(config: SymviewConfig) -> SymviewConfig:
+    """Return the configuration for observations that have the gripper's pose, which joints do not transform as."""
+    on_poses = copy(config)
+    on_poses.arm = {}
+    return on_poses
 
 
 def transform_observation(

@@ -17,12 +17,15 @@ from lerobot_policy_symview.equivariance import (
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
+from lerobot_policy_symview.symmetry.representations import types_of
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview import keys
 from lerobot_symview.geometry.lens import PLUMB_BOB, Lens
 from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.kinematics.arm import INCREMENT, STATE
 from lerobot_symview.views import ViewSpec
 from symview_sim.settings import EnvSettings
+from tests.helpers.arms import so101_arm
 from tests.helpers.policies import make_config, make_policy, take_training_steps, training_batch
 
 BROKEN = [method for method in METHODS if method.endswith("_broken")]
@@ -45,6 +48,13 @@ def test_methods_are_equivariant_before_and_after_training_and_loading(method, t
     loaded = SymviewBcPolicy.from_pretrained(tmp_path)
     assert_equivariant(loaded, make_pre_post_processors(loaded.config, str(tmp_path)))
     assert_equivariant(loaded.double(), tolerance=1e-10)
+
+
+def test_a_policy_that_drives_joints_is_checked_on_the_grippers_poses():
+    types = types_of(STATE)
+    policy = make_policy(arm=so101_arm().plain(), state_symmetry=types, action_symmetry=types_of(INCREMENT))
+    assert_equivariant(policy)
+    assert policy.config.arm
 
 
 @pytest.mark.long
