@@ -23,7 +23,18 @@ from lerobot_symview.datasets.robot_flags import RobotFlags
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.kinematics import arm_from_plain
 from lerobot_symview.runtime.cli import CommandError
-from tests.helpers.arms import CAMERAS, JOINTS, NAMES, SO101, SO101_MJCF, arm_recording, mujoco_places, record_arm, yaws
+from tests.helpers.arms import (
+    CAMERAS,
+    JOINTS,
+    NAMES,
+    SO101,
+    SO101_MJCF,
+    arm_recording,
+    mujoco_places,
+    record_arm,
+    so101,
+    yaws,
+)
 from tests.helpers.datasets import contents, interrupted_at_the_second_part
 
 FRAMES, EPISODES = 40, 2
@@ -75,7 +86,10 @@ def test_states_are_where_the_simulator_has_the_gripper_in_the_axes_of_the_base(
     yaw = yaws(matrices[:, :, 0], matrices[:, :, 2])
     assert np.rad2deg(np.abs(np.sin(state[:, 3] - yaw))).max() < 0.1
     np.testing.assert_allclose(state[:, 4], aperture, atol=1e-6)
-    np.testing.assert_allclose(np.cos(state[:, 5]), -matrices[:, 2, 0], atol=1e-4)
+    outwards = places[:, :2] - so101().pivot
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    tilt = np.arctan2((matrices[:, :2, 0] * outwards).sum(axis=1), -matrices[:, 2, 0])
+    np.testing.assert_allclose(state[:, 5], tilt, atol=2e-4)
 
 
 def test_an_increment_leads_to_the_targets_of_the_joints(converted):
