@@ -180,7 +180,7 @@ EXPERIMENTS = {
         ),
         Experiment(
             "chunks",
-            "Action chunks from demonstrations like a person's",
+            "Action chunks, demonstrations in the style of people",
             CHUNKED,
             CLONED_TASKS,
             (25,),
@@ -188,7 +188,7 @@ EXPERIMENTS = {
         ),
         Experiment(
             "chunks_planner",
-            "Action chunks from a planner's demonstrations",
+            "Action chunks, demonstrations of the planner",
             CHUNKED,
             CLONED_TASKS,
             (25,),

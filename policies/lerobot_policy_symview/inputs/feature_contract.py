@@ -251,7 +251,11 @@ def _image_size(meta: Any, camera: str) -> tuple[int, int] | None:
     if size is not None:
         return size
     left_out = read_settings(Path(meta.root), ADDED_VIEWS).get("image_sizes", {}).get(keys.rgb(camera))
-    return (int(left_out[0]), int(left_out[1])) if left_out else None
+    if left_out:
+        return (int(left_out[0]), int(left_out[1]))
+    recorded = _calibration_file(meta)
+    in_file = recorded.cameras.get(camera) if recorded else None
+    return (in_file.height, in_file.width) if in_file else None
 
 
 def _calibration_file(meta: Any) -> Calibration | None:
