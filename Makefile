@@ -4,16 +4,19 @@ PYTHON := .venv/bin/python
 READY := .venv/.ready
 UV_VERSION := 0.13.9
 
-.PHONY: demo test test-fast lint docs setup doctor pins clean
+.PHONY: demo test test-fast test-learning lint docs setup doctor pins clean
 
 demo: $(READY) ## demonstrations, views, training, evaluation and a report in outputs/demo
 	@.venv/bin/symview-demo $(ARGS)
 
-test: $(READY) lint ## every test, slow ones included
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(ARGS)
+test: $(READY) lint ## every test but that of test-learning, slow ones included
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not learning" $(ARGS)
+
+test-learning: $(READY) ## a training of a policy of chunks that must reach 75 %: 5 minutes on one core
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest -m learning $(ARGS)
 
 test-fast: $(READY) lint ## the tests that take seconds: under 4 minutes on 2 cores
-	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not slow and not long and not install" $(ARGS)
+	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not slow and not long and not install and not learning" $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

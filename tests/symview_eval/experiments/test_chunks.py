@@ -6,7 +6,7 @@ from symview_eval.experiments.cli import ExperimentConfig, run_experiment
 from symview_eval.experiments.results import read_result
 
 
-@pytest.mark.slow
+@pytest.mark.learning
 @pytest.mark.usefixtures("unchecked_kernels")
 def test_flow_matching_solves_picking_from_25_demonstrations_of_people(tmp_path):
     """docs/results.md has the success rates of several seeds, of regression and of LeRobot's own policies."""
