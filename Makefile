@@ -9,10 +9,10 @@ UV_VERSION := 0.13.9
 demo: $(READY) ## demonstrations, views, training, evaluation and a report in outputs/demo
 	@.venv/bin/symview-demo $(ARGS)
 
-test: $(READY) lint ## every test but that of test-learning, slow ones included
+test: $(READY) lint ## every test but those of test-learning, slow ones included
 	OMP_NUM_THREADS=1 $(PYTHON) -m pytest --numprocesses=auto --dist=loadfile --no-loadscope-reorder -m "not learning" $(ARGS)
 
-test-learning: $(READY) ## a training of a policy of chunks that must reach 75 %: 5 minutes on one core
+test-learning: $(READY) ## trainings that must reach 70 and 75 %: a quarter of an hour on one core
 	OMP_NUM_THREADS=1 $(PYTHON) -m pytest -m learning $(ARGS)
 
 test-fast: $(READY) lint ## the tests that take seconds: under 4 minutes on 2 cores

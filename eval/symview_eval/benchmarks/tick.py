@@ -5,20 +5,18 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.utils import preprocess_observation
+from lerobot.policies.factory import get_policy_class
 from torch import Tensor, nn
 
 from lerobot_policy_symview.chunks import ChunkPolicy
 from lerobot_policy_symview.configuration_chunks import ChunkConfig
-from lerobot_policy_symview.configuration_symview_flow import SymviewFlowConfig
 from lerobot_policy_symview.equivariance import checked_group, equivariance_errors, example_observation, is_exact
 from lerobot_policy_symview.inputs.history import as_history
-from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
-from lerobot_policy_symview.modeling_symview_flow import SymviewFlowPolicy
 from lerobot_policy_symview.processor_pipelines import make_processors
 from lerobot_policy_symview.rl.rollouts import metric_depth
 from lerobot_symview import keys
@@ -87,7 +85,7 @@ def benchmark_ticks(config: ChunkConfig, batch_size: int, repeats: int) -> dict[
 def make_chunk_policy(config: ChunkConfig) -> ChunkPolicy:
     """Return an untrained policy of a configuration."""
     config.output_features = {keys.ACTION: PolicyFeature(FeatureType.ACTION, (len(config.action_symmetry),))}
-    kind = SymviewFlowPolicy if isinstance(config, SymviewFlowConfig) else SymviewBcPolicy
+    kind: Any = get_policy_class(config.type)
     policy: ChunkPolicy = kind(config).to(config.device)
     return policy
 

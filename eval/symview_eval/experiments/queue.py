@@ -56,7 +56,7 @@ class Costs:
 def _keys(experiment: Experiment, row: MethodRow, task: str) -> list[tuple[str, ...]]:
     kind = experiment.name if experiment.placements or row.chunks else experiment.algorithm
     method = row.name if row.chunks else row.policy["method"]
-    return [(kind, row.name, task), (kind, method, task), (kind, method), (kind,)]
+    return list(dict.fromkeys([(kind, row.name, task), (kind, method, task), (kind, method), (kind,)]))
 
 
 def chosen_cells(

@@ -65,13 +65,11 @@ def crop(images: Tensor, size: int, offset: Tensor | None = None) -> Tensor:
         offset: (B, 2) in [0, 1), the crop offset of each image, row and column, relative to the largest; by default
             the centre crop.
     """
-    batch, channels, height, width = images.shape
+    batch, _, height, width = images.shape
     if offset is None:
         top, left = (height - size) // 2, (width - size) // 2
         return images[..., top : top + size, left : left + size]
     row, column = offset.unbind(-1)
     corner = torch.stack([row * (height - size + 1), column * (width - size + 1)], dim=-1).long()
-    rows, columns = (corner[..., None] + torch.arange(size, device=corner.device)).unbind(dim=1)
-    index = torch.arange(batch, device=corner.device)[:, None, None, None]
-    every = torch.arange(channels, device=corner.device)[:, None, None]
-    return images[index, every, rows[:, None, :, None], columns[:, None, None]]
+    windows = images.unfold(2, size, 1).unfold(3, size, 1)  # (B, C, row, column, size, size), all crops, not copied
+    return windows[torch.arange(batch, device=corner.device), :, corner[:, 0], corner[:, 1]]

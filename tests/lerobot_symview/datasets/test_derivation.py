@@ -172,14 +172,25 @@ def test_a_source_of_several_files_gets_views_in_every_file(several_files, with_
         assert episode in pq.read_table(result.root / place, columns=["episode_index"])["episode_index"].to_pylist()
 
 
+def paused_run(source, target):
+    """Start a run and pause it while it writes; on a busy machine, one may end first, and is begun again."""
+    while True:
+        process = subprocess.Popen(add_views_command(source, target), stdout=subprocess.DEVNULL)
+        while not target.with_name(f"{target.name}.partial").exists() and process.poll() is None:
+            time.sleep(0.005)
+        process.send_signal(signal.SIGSTOP)
+        if not target.exists():
+            assert process.poll() is None
+            return process
+        process.send_signal(signal.SIGCONT)
+        assert process.wait() == 0
+        shutil.rmtree(target)
+
+
 def test_a_second_run_is_refused_while_the_first_is_paused(several_files, tmp_path):
     """And the first, once it goes on, writes what it would have written alone."""
-    target, partial = tmp_path / "derived", tmp_path / "derived.partial"
-    process = subprocess.Popen(add_views_command(several_files, target), stdout=subprocess.DEVNULL)
-    while not partial.exists():
-        assert process.poll() is None
-        time.sleep(0.005)
-    process.send_signal(signal.SIGSTOP)
+    target = tmp_path / "derived"
+    process = paused_run(several_files, target)
     for resume in (False, True):
         with pytest.raises(CommandError, match=f"derived is being written by process {process.pid} on .*--new_root"):
             add_views(views_config(several_files, target, resume=resume))
