@@ -105,6 +105,20 @@ def test_the_rollout_command_drives_the_robot_by_the_checkpoint_alone(checkpoint
         assert np.abs(targets - joints)[:5].max() < 10.01  # --policy.max_joint_step
 
 
+def test_what_the_policy_does_is_recorded_and_is_a_demonstration(checkpoint, recorded, monkeypatch, tmp_path):
+    arguments = ["--robot.type=so101_sim", "--robot.seed=5", f"--policy.path={checkpoint}", "--device=cpu", "--fps=10"]
+    arguments += ["--strategy.type=episodic", "--dataset.repo_id=test/rollout_so101", f"--dataset.root={tmp_path / 'run'}"]
+    arguments += ["--dataset.single_task=Lift the cube.", "--dataset.num_episodes=1", "--dataset.episode_time_s=2"]
+    arguments += ["--dataset.video=false", "--dataset.push_to_hub=false", "--dataset.no_stamp=true", "--play_sounds=false"]
+    run_command(monkeypatch, lerobot_rollout, *arguments)
+    demonstrations, run = LeRobotDataset("test/a", root=recorded), LeRobotDataset("test/b", root=tmp_path / "run")
+    assert run.meta.features == demonstrations.meta.features
+    assert len(run) > 2
+    views = LeRobotDataset("test/c", root=view(convert(tmp_path / "run")))
+    assert len(views) == len(run)
+    assert keys.view("side", "reproj") in views.meta.features
+
+
 @pytest.mark.parametrize(
     ("options", "part", "kept"),
     [
