@@ -106,15 +106,16 @@ def test_the_rollout_command_drives_the_robot_by_the_checkpoint_alone(checkpoint
 
 
 def test_what_the_policy_does_is_recorded_and_is_a_demonstration(checkpoint, recorded, monkeypatch, tmp_path):
+    root = tmp_path / "run"
     arguments = ["--robot.type=so101_sim", "--robot.seed=5", f"--policy.path={checkpoint}", "--device=cpu", "--fps=10"]
-    arguments += ["--strategy.type=episodic", "--dataset.repo_id=test/rollout_so101", f"--dataset.root={tmp_path / 'run'}"]
+    arguments += ["--strategy.type=episodic", "--dataset.repo_id=test/rollout_so101", f"--dataset.root={root}"]
     arguments += ["--dataset.single_task=Lift the cube.", "--dataset.num_episodes=1", "--dataset.episode_time_s=2"]
-    arguments += ["--dataset.video=false", "--dataset.push_to_hub=false", "--dataset.no_stamp=true", "--play_sounds=false"]
+    arguments += ["--dataset.video=false", "--dataset.push_to_hub=false", "--play_sounds=false"]
     run_command(monkeypatch, lerobot_rollout, *arguments)
-    demonstrations, run = LeRobotDataset("test/a", root=recorded), LeRobotDataset("test/b", root=tmp_path / "run")
+    demonstrations, run = LeRobotDataset("test/a", root=recorded), LeRobotDataset("test/b", root=root)
     assert run.meta.features == demonstrations.meta.features
     assert len(run) > 2
-    views = LeRobotDataset("test/c", root=view(convert(tmp_path / "run")))
+    views = LeRobotDataset("test/c", root=view(convert(root)))
     assert len(views) == len(run)
     assert keys.view("side", "reproj") in views.meta.features
 
