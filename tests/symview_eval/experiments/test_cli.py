@@ -126,6 +126,7 @@ def test_the_report_has_every_row_and_embeds_its_images(table1, tmp_path):
     assert "scale=" not in page
     assert "name=smoke" in page
     assert page.count("<td>Reproj. Equi</td>") == 5
+    assert "<th>best</th>" in page
     assert 'src="data:image/png' in page
     assert 'src="table1' not in page
     assert (tmp_path / "table1_smoke.png").read_bytes().startswith(b"\x89PNG")
@@ -261,6 +262,8 @@ def test_the_report_covers_the_committed_results(tmp_path):
     results = ROOT / "results"
     page = report(ReportConfig(results, tmp_path)).read_text()
     assert "computed with other settings" not in page
+    assert "<th>success</th>" in page
+    assert "<th>best</th>" not in page
     entries = table_entries(EXPERIMENTS["table1"], "laptop", results)
     assert sum(len(entry.results) for entry in entries) == len(list((results / "table1" / "laptop").rglob("*.csv")))
 
