@@ -17,7 +17,7 @@ from typing import cast
 import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.rl.checkpoints import last_checkpoint
+from lerobot_policy_symview.rl.checkpoints import cpu_seconds, last_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
@@ -148,7 +148,7 @@ def _run(job: CellJob) -> None:
     times, earlier_s = Times(), 0.0
     if cell.algorithm == "sacfd":
         assert isinstance(env, EnvSettings)
-        checkpoints = _run_rl(job, env)
+        checkpoints, times = _run_rl(job, env)
     elif cell.placements:
         if not job.policy.is_dir():
             _clone(job, env)
@@ -180,8 +180,8 @@ def _clone(job: CellJob, env: WorldSettings) -> CloningResult:
     return training
 
 
-def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
-    """Start or resume `symview-train-rl` for a cell, and return its evaluations."""
+def _run_rl(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
+    """Start or resume `symview-train-rl` for a cell; return its evaluations and its CPU time."""
     cell = job.cell
     config = TrainRlConfig(
         dataset=job.demonstrations,
@@ -196,6 +196,7 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         seed=cell.seed,
         eval_every=cell.eval_every,
         eval_episodes=cell.eval_episodes,
+        save_every=cell.eval_every,
         resume=True,
     )
     try:
@@ -204,8 +205,8 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         logger.info("%s: training starts from the beginning: %s", cell, error)
         shutil.rmtree(job.output, ignore_errors=True)
         config = replace(config, resume=False)
-    train_rl(config)
-    return [
+    last = train_rl(config)
+    checkpoints = [
         Checkpoint(
             step=int(row["step"]),
             successes=round(row["success"] * cell.eval_episodes),
@@ -215,6 +216,7 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         )
         for row in read_table(job.output / "evaluation.csv")
     ]
+    return checkpoints, Times(cpu_s=cpu_seconds(last))
 
 
 def _machine(device: str) -> str:

@@ -204,12 +204,17 @@ def test_a_changed_rl_cell_starts_from_the_beginning(tmp_path, monkeypatch):
         last.mkdir(parents=True, exist_ok=True)
         (last / "train_config.json").write_text(json.dumps(describe(configuration)))
         (configuration.output_dir / "evaluation.csv").write_text("step,success,return\n1,1.0,0.5\n")
+        state = last.parent / "training_state" / "state.json"
+        state.parent.mkdir(exist_ok=True)
+        state.write_text(json.dumps({"cpu_s": 12.5}))
+        return last.parent
 
     monkeypatch.setattr(cells_module, "train_rl", train)
     longer = dataclasses.replace(cell, scale=dataclasses.replace(cell.scale, rl_steps=3))
     for next_cell in (cell, cell, longer):
         assert cells_module.run_cell(dataclasses.replace(job, cell=next_cell)).failure == ""
     assert resumed == [False, True, False]
+    assert read_result(job.results / cell.path).times.cpu_s == 12.5
 
 
 def test_a_second_run_is_refused_while_the_first_is_alive(tmp_path):
