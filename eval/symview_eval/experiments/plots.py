@@ -88,7 +88,7 @@ def _rows(entries: Sequence[TableEntry]) -> Figure:
         axis.set_xlim(-2, 102)
         axis.set_xlabel("success, %", fontsize=9)
     which = "" if is_one else "last five checkpoints, "
-    styles = [
+    styles: list[dict[str, Any]] = [
         {"marker": "|", "color": MEASURED_COLOR, "markersize": 12, "label": f"{which}mean and 95 % interval"},
         {"marker": "o", "color": MEASURED_COLOR, "label": "best checkpoint"},
         {"marker": "D", "color": PAPER_COLOR, "fillstyle": "none", "label": "paper, best checkpoint"},
@@ -152,8 +152,15 @@ def _curves(entries: Sequence[TableEntry]) -> Figure:
         axis.set_xlim(left=0)
         axis.set_ylim(0, 1)
         axis.legend(fontsize=7)
-    band = {"marker": "s", "markersize": 10, "color": "gray", "alpha": 0.3, "label": "standard deviation of the seeds"}
-    _legend(figure, [*({"marker": ".", "color": color, "label": label} for label, color in colors.items()), band])
+    band: dict[str, Any] = {
+        "marker": "s",
+        "markersize": 10,
+        "color": "gray",
+        "alpha": 0.3,
+        "label": "standard deviation of the seeds",
+    }
+    styles: list[dict[str, Any]] = [{"marker": ".", "color": color, "label": label} for label, color in colors.items()]
+    _legend(figure, [*styles, band])
     return figure
 
 
