@@ -17,7 +17,7 @@ from typing import cast
 import torch
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
-from lerobot_policy_symview.rl.checkpoints import last_checkpoint
+from lerobot_policy_symview.rl.checkpoints import cpu_seconds, last_checkpoint
 from lerobot_policy_symview.rl.demonstrations import open_dataset
 from lerobot_policy_symview.rl.metrics import read_table
 from lerobot_policy_symview.rl.train_config import TrainRlConfig
@@ -27,11 +27,12 @@ from lerobot_symview.datasets.hub import HubDataset
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.runtime.staging import part_of
 from symview_eval.experiments.actors import load_actor, save_actor, sight
-from symview_eval.experiments.cloning import run_cloning
+from symview_eval.experiments.cloning import CloningResult, run_cloning
 from symview_eval.experiments.grid import Cell
 from symview_eval.experiments.placements import evaluate_placements
 from symview_eval.experiments.results import Checkpoint, Origin, Result, Times, write_result
 from symview_eval.experiments.simulators import world_settings
+from symview_eval.experiments.training_state import Checkpoints, remove
 from symview_sim.generate import GenerateConfig, RecordedWorld, generate
 from symview_sim.settings import EnvSettings, NewDataset, WorldSettings
 
@@ -73,8 +74,13 @@ class CellJob:
 
     @property
     def policy(self) -> Path:
-        """Folder of the cloned policy's checkpoint."""
+        """Folder of the cloned policy."""
         return self.output / "pretrained_model"
+
+    @property
+    def training_state(self) -> Path:
+        """Folder of the checkpoints of an unfinished cloning."""
+        return self.output / "training_state"
 
 
 @dataclass(frozen=True)
@@ -139,39 +145,43 @@ def _run(job: CellJob) -> None:
         max_steps=cell.max_steps,
         **cell.world,
     )
-    times = Times()
+    times, earlier_s = Times(), 0.0
     if cell.algorithm == "sacfd":
         assert isinstance(env, EnvSettings)
-        checkpoints = _run_rl(job, env)
+        checkpoints, times = _run_rl(job, env)
     elif cell.placements:
         if not job.policy.is_dir():
-            _train(job, env)
+            _clone(job, env)
         checkpoints, times = evaluate_placements(cell, load_actor(cell, job.policy), env)
     else:
-        checkpoints, times = _train(job, env)
+        training = _clone(job, env)
+        checkpoints, times, earlier_s = training.evaluations, training.times, training.earlier_s
     origin = Origin(
         configuration=cell.configuration_hash,
         seed=cell.seed,
         version=version("lerobot_policy_symview"),
         machine=_machine(job.device),
-        seconds=time.perf_counter() - start,
+        seconds=time.perf_counter() - start + earlier_s,
         device=job.device,
     )
     write_result(job.results / cell.path, Result(origin, times, checkpoints))
+    remove(job.training_state)
 
 
-def _train(job: CellJob, env: WorldSettings) -> tuple[list[Checkpoint], Times]:
-    """Clone the demonstrations and save the policy; return the evaluations during the training and its times."""
-    training = run_cloning(job.cell, open_dataset(job.training_data), env, job.device)
+def _clone(job: CellJob, env: WorldSettings) -> CloningResult:
+    """Start or resume a behaviour cloning, and save its policy."""
+    made_by = {package: version(package) for package in ("lerobot_policy_symview", "lerobot", "torch")}
+    saved = Checkpoints(job.training_state, made_by | {"device": job.device})
+    training = run_cloning(job.cell, open_dataset(job.training_data), env, job.device, saved)
     part = part_of(job.policy)
     save_actor(training.actor, part)
     shutil.rmtree(job.policy, ignore_errors=True)
     part.rename(job.policy)
-    return training.checkpoints, training.times
+    return training
 
 
-def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
-    """Start or resume `symview-train-rl` for a cell, and return its evaluations."""
+def _run_rl(job: CellJob, env: EnvSettings) -> tuple[list[Checkpoint], Times]:
+    """Start or resume `symview-train-rl` for a cell; return its evaluations and its CPU time."""
     cell = job.cell
     config = TrainRlConfig(
         dataset=job.demonstrations,
@@ -186,6 +196,7 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         seed=cell.seed,
         eval_every=cell.eval_every,
         eval_episodes=cell.eval_episodes,
+        save_every=cell.eval_every,
         resume=True,
     )
     try:
@@ -194,8 +205,8 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         logger.info("%s: training starts from the beginning: %s", cell, error)
         shutil.rmtree(job.output, ignore_errors=True)
         config = replace(config, resume=False)
-    train_rl(config)
-    return [
+    last = train_rl(config)
+    checkpoints = [
         Checkpoint(
             step=int(row["step"]),
             successes=round(row["success"] * cell.eval_episodes),
@@ -205,6 +216,7 @@ def _run_rl(job: CellJob, env: EnvSettings) -> list[Checkpoint]:
         )
         for row in read_table(job.output / "evaluation.csv")
     ]
+    return checkpoints, Times(cpu_s=cpu_seconds(last))
 
 
 def _machine(device: str) -> str:

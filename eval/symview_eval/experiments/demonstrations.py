@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -50,15 +51,23 @@ class Demonstrations:
         self._chunks = _neighbours(config.action_delta_indices, first, last)
         self._starts = _starts(last, getattr(config, "drop_n_last_frames", 0))
 
-    def batches(self, size: int, seed: int) -> Iterator[dict[str, Tensor]]:
-        """Yield batches of `size` samples without end; each pass visits every sample once in random order."""
+    def batches(self, size: int, seed: int, start: int = 0) -> Iterator[dict[str, Tensor]]:
+        """Yield batches of `size` samples without end; each pass visits every sample once in random order.
+
+        The first `start` batches are left out, as when a training continues after as many steps.
+        """
+        for chosen in islice(self._order(size, seed), start, None):
+            yield self.samples(chosen)
+
+    def _order(self, size: int, seed: int) -> Iterator[Tensor]:
+        """Yield the frames (size,) at which the samples of every batch start."""
         generator = torch.Generator().manual_seed(seed)
         order = torch.empty(0, dtype=torch.long)
         while True:
             while len(order) < size:
                 order = torch.cat([order, self._starts[torch.randperm(len(self._starts), generator=generator)]])
             chosen, order = order[:size], order[size:]
-            yield self.samples(chosen)
+            yield chosen
 
     def samples(self, chosen: Tensor) -> dict[str, Tensor]:
         """Return the samples of frames (B,) as a batch for the policy's training."""

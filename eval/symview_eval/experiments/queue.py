@@ -26,10 +26,7 @@ FIRST_CHUNK_TASKS = ("block_picking", "block_pushing", "block_stacking")
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds that cells took: of the same method and task, else of the method, else of all cells.
-
-    They are processor seconds, and wall-clock seconds for reinforcement learning, whose processor time is not measured.
-    """
+    """Processor seconds that cells took: of the same method and task, else of the method, else of all cells."""
 
     medians: dict[tuple[str, ...], float] = field(default_factory=dict)
 
@@ -39,10 +36,10 @@ class Costs:
         seconds: dict[tuple[str, ...], list[float]] = {}
         for path, result in finished.items():
             table, _, task, row = path.parts[:4]  # as in `Cell.path`
-            cell_seconds = result.origin.seconds if math.isnan(result.times.cpu_s) else result.times.cpu_s
-            if row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
+            is_measured = not math.isnan(result.times.cpu_s)
+            if is_measured and row in (rows := {row.name: row for row in EXPERIMENTS[table].rows}):
                 for key in _keys(EXPERIMENTS[table], rows[row], task):
-                    seconds.setdefault(key, []).append(cell_seconds)
+                    seconds.setdefault(key, []).append(result.times.cpu_s)
         return cls({key: statistics.median(values) for key, values in seconds.items()})
 
     def seconds(self, cell: Cell) -> float | None:

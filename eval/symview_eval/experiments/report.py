@@ -62,6 +62,11 @@ class Section:
         return f"{self.experiment.name}_{self.scale.name}"
 
     @property
+    def has_one_checkpoint(self) -> bool:
+        """Whether best, last and mean of the last five are the same rate everywhere."""
+        return all(entry.has_one_checkpoint for entry in self.entries)
+
+    @property
     def holding(self) -> list[MethodPair]:
         """Pairs whose order in the paper holds here with a probability of 95 % or more."""
         return [pair for pair in self.pairs if pair.probability >= CONFIDENT]

@@ -7,7 +7,7 @@ import io
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,6 +66,15 @@ class Times:
     """Evaluations, most of them in parallel with the training."""
     cpu_s: float = math.nan
     """CPU time of the whole cell, simulators included."""
+
+    @property
+    def wall_clock_s(self) -> float:
+        """Wall-clock time of all parts; evaluations during the training add nothing to it."""
+        return self.preparation_s + self.training_s + self.waiting_s
+
+    def __add__(self, other: Times) -> Times:
+        """Return the sums of all times."""
+        return Times(*(one + another for one, another in zip(astuple(self), astuple(other), strict=True)))
 
 
 @dataclass(frozen=True)

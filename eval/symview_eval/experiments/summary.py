@@ -67,6 +67,11 @@ class TableEntry(Entry):
         return sum(point.episodes for result in self.results for point in result.checkpoints[-LAST_CHECKPOINTS:])
 
     @property
+    def has_one_checkpoint(self) -> bool:
+        """Whether every training was evaluated once, so that all its rates are equal."""
+        return all(len(result.checkpoints) == 1 for result in self.results)
+
+    @property
     def difference(self) -> float:
         """Mean of `best` minus the paper's rate."""
         return self.best.mean - self.paper

@@ -65,6 +65,7 @@ def save_checkpoint(training: Training, run_id: str | None) -> Path:
         "episodes_started": training.episodes_started,
         "window": training.window.to_json(),
         "rng": training.rng.bit_generator.state,
+        "cpu_s": training.cpu_s,
         "wandb_run_id": run_id,
     }
     (state / STATE).write_text(json.dumps(content))
@@ -119,10 +120,16 @@ def restore(training: Training, folder: Path) -> str | None:
     ]
     training.window = MetricsWindow(**content["window"])
     training.rng.bit_generator.state = content["rng"]
+    training.earlier_cpu_s = content["cpu_s"]
     training.restore_simulators()
     load_rng_state(state)
     run_id: str | None = content["wandb_run_id"]
     return run_id
+
+
+def cpu_seconds(folder: Path) -> float:
+    """Return the CPU time of a run up to a checkpoint, simulators included."""
+    return float(json.loads((folder / TRAINING_STATE_DIR / STATE).read_text())["cpu_s"])
 
 
 def last_checkpoint(config: TrainRlConfig) -> Path | None:

@@ -73,6 +73,9 @@ class Training:
         self.window = MetricsWindow()
         self.rng = np.random.default_rng(config.seed)
         self.seconds = dict.fromkeys(("network", "waiting", "simulation", "total"), 0.0)
+        self.earlier_cpu_s = 0.0
+        """CPU time of the runs that this one resumes, up to their last checkpoints."""
+        self._begin_cpu_s = time.process_time()
 
     def __enter__(self) -> Training:
         return self
@@ -85,6 +88,13 @@ class Training:
         self.simulators.close()
         if self._evaluators is not None:
             self._evaluators.close()
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time so far, of simulators and earlier runs too, seconds."""
+        evaluators_s = self._evaluators.cpu_seconds() if self._evaluators is not None else 0.0
+        own_s = time.process_time() - self._begin_cpu_s
+        return self.earlier_cpu_s + own_s + self.simulators.cpu_seconds() + evaluators_s
 
     def start(self) -> None:
         """Start a new run: store the demonstrations, and start an episode in every simulator."""

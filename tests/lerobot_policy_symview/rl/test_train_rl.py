@@ -17,6 +17,7 @@ from lerobot_policy_symview.equivariance import assert_equivariant
 from lerobot_policy_symview.methods import METHODS
 from lerobot_policy_symview.modeling_symview_sacfd import SymviewSacfdPolicy
 from lerobot_policy_symview.rl import train_rl as command
+from lerobot_policy_symview.rl.checkpoints import cpu_seconds
 from lerobot_policy_symview.rl.demonstrations import open_dataset, rewards_and_ends
 from lerobot_policy_symview.rl.learner import WEIGHTS
 from lerobot_policy_symview.rl.metrics import read_table
@@ -56,7 +57,8 @@ def state_of(checkpoint):
     for name in ("actor", "critic", "temperature"):
         optimizer = load_file(checkpoint / "training_state" / name / "optimizer_state.safetensors")
         weights |= {f"{name}.{key}": value for key, value in optimizer.items()}
-    return weights, json.loads((checkpoint / "training_state" / "state.json").read_text())
+    state = json.loads((checkpoint / "training_state" / "state.json").read_text())
+    return weights, {name: value for name, value in state.items() if name != "cpu_s"}
 
 
 def assert_same_run(one, other):
@@ -142,6 +144,8 @@ def test_a_resumed_run_is_bit_identical_to_the_uninterrupted_one(recorded, whole
     assert_same_run(last, whole)
     kept = [folder.name for folder in last.parent.iterdir() if (folder / "training_state" / "replay").is_dir()]
     assert sorted(kept) == ["000006", "last"]
+    spent = [cpu_seconds(last.parent / name) for name in ("000003", "000005", "000006")]
+    assert 0 < spent[0] < spent[1] < spent[2]  # that of the runs before included
     assert signal.getsignal(signal.SIGINT) is handler  # Python's own, or none in a shell's background
 
 

@@ -126,6 +126,7 @@ def test_the_report_has_every_row_and_embeds_its_images(table1, tmp_path):
     assert "scale=" not in page
     assert "name=smoke" in page
     assert page.count("<td>Reproj. Equi</td>") == 5
+    assert "<th>best</th>" in page
     assert 'src="data:image/png' in page
     assert 'src="table1' not in page
     assert (tmp_path / "table1_smoke.png").read_bytes().startswith(b"\x89PNG")
@@ -203,12 +204,17 @@ def test_a_changed_rl_cell_starts_from_the_beginning(tmp_path, monkeypatch):
         last.mkdir(parents=True, exist_ok=True)
         (last / "train_config.json").write_text(json.dumps(describe(configuration)))
         (configuration.output_dir / "evaluation.csv").write_text("step,success,return\n1,1.0,0.5\n")
+        state = last.parent / "training_state" / "state.json"
+        state.parent.mkdir(exist_ok=True)
+        state.write_text(json.dumps({"cpu_s": 12.5}))
+        return last.parent
 
     monkeypatch.setattr(cells_module, "train_rl", train)
     longer = dataclasses.replace(cell, scale=dataclasses.replace(cell.scale, rl_steps=3))
     for next_cell in (cell, cell, longer):
         assert cells_module.run_cell(dataclasses.replace(job, cell=next_cell)).failure == ""
     assert resumed == [False, True, False]
+    assert read_result(job.results / cell.path).times.cpu_s == 12.5
 
 
 def test_a_second_run_is_refused_while_the_first_is_alive(tmp_path):
@@ -261,6 +267,8 @@ def test_the_report_covers_the_committed_results(tmp_path):
     results = ROOT / "results"
     page = report(ReportConfig(results, tmp_path)).read_text()
     assert "computed with other settings" not in page
+    assert "<th>success</th>" in page
+    assert "<th>best</th>" not in page
     entries = table_entries(EXPERIMENTS["table1"], "laptop", results)
     assert sum(len(entry.results) for entry in entries) == len(list((results / "table1" / "laptop").rglob("*.csv")))
 

@@ -125,6 +125,34 @@ def test_learning_curves_end_with_the_shortest_seed(tmp_path):
     figure = plot(figure5, "laptop", table_entries(figure5, "laptop", tmp_path))
     assert list(figure.axes[0].lines[0].get_xdata()) == [200, 400]
     assert "scale laptop" in figure.get_suptitle()
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["2 seeds"]
+    assert legend(figure) == ["Reproj. Equi", "standard deviation of the seeds"]
+
+
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+@pytest.mark.parametrize(
+    ("experiment", "successes", "shown"),
+    [
+        ("table1", [10], ["mean and 95 % interval", "paper, best checkpoint"]),
+        (
+            "table1",
+            [10, 12],
+            ["last five checkpoints, mean and 95 % interval", "best checkpoint", "paper, best checkpoint"],
+        ),
+        ("hidden", [10], ["mean and 95 % interval"]),
+        ("figure7", [10], ["Oracle Equi (RGBD)", "Oracle Equi (RGB)"]),
+    ],
+)
+def test_a_legend_names_what_is_drawn(experiment, successes, shown, tmp_path):
+    """One evaluation has no best checkpoint, and the paper has no value of our own experiments."""
+    experiment = EXPERIMENTS[experiment]
+    methods = [row.name for row in experiment.rows if row.name.startswith("oracle")]
+    for cell in select(experiment, SCALE, ["block_picking"], methods, [10], [0]):
+        write_result(tmp_path / cell.path, result(cell.configuration_hash, successes))
+    assert legend(plot(experiment, "laptop", table_entries(experiment, "laptop", tmp_path))) == shown
 
 
 def test_results_with_other_settings_are_not_current(tmp_path):
