@@ -42,12 +42,13 @@ def test_known_points_appear_where_the_camera_projects_them(spec):
 
     def draw(wide):
         assert wide.lens is None
-        rgb = np.zeros((wide.height, wide.width, 3), dtype=np.uint8)
-        v, u = np.indices(rgb.shape[:2])
+        labels = np.zeros((wide.height, wide.width), dtype=np.uint8)
+        v, u = np.indices(labels.shape)
         pixels, depth = project(points, wide)
         for label, (column, row) in enumerate(pixels, start=1):
-            rgb[np.hypot(u - column, v - row) < 3 * SAMPLES] = label
-        return CameraImages(rgb, np.append(0, depth)[rgb[..., 0]].astype(np.float32))
+            labels[np.hypot(u - column, v - row) < 3 * SAMPLES] = label
+        rgb = np.repeat(np.where(labels > 0, np.uint8(255), np.uint8(0))[..., None], 3, axis=-1)
+        return CameraImages(rgb, np.append(0, depth)[labels].astype(np.float32), labels)
 
     image = through_lens(draw, camera)
     assert image.rgb.shape == (camera.height, camera.width, 3)
@@ -55,10 +56,11 @@ def test_known_points_appear_where_the_camera_projects_them(spec):
     without, _ = project(points, replace(camera, lens=None))
     assert np.abs(without - pixels).max() > 1.0
     for label, (column, row) in enumerate(pixels, start=1):
-        rows, columns = np.nonzero(image.rgb[..., 0] == label)
+        rows, columns = np.nonzero(image.labels == label)
         assert len(rows) > 10
         np.testing.assert_allclose((columns.mean(), rows.mean()), (column, row), atol=0.3)
         assert image.depth[rows, columns] == pytest.approx(depth[label - 1])
+    assert ((image.rgb[..., 0] > 127) != (image.labels > 0)).mean() < 0.001
 
 
 def seen(camera, seed=0):
