@@ -1,8 +1,9 @@
 """What a camera with a lens sees: the image of a wider pinhole camera, resampled.
 
-The wider image has three times as many pixels in a row. Colour is the mean of the nine around the pixel's ray, as much
-as a pixel sees. Depth and labels are those of the nearest one, at most a sixth of a pixel away: a mean of two depths
-lies on neither surface. Depth is along the optical axis, which is that of the wider camera, so it stays as it is.
+Each pixel takes colour, depth and label of the nearest pixel of an image with three times as many in a row, at most a
+sixth of a pixel away. Nothing is averaged: a mean of two depths lies on neither surface, and a mean of colours differs
+from what the simulators draw without a lens. Depth is along the optical axis, which is that of the wider camera, so it
+stays as it is.
 """
 
 from __future__ import annotations
@@ -10,9 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import cast
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,7 +38,6 @@ def through_lens(draw: Callable[[Camera], CameraImages], camera: Camera) -> Came
     wide = pinhole_camera(camera)
     rows, columns = _nearest_pixels(camera, wide)
     rgb, depth, labels = draw(wide)
-    rgb = cast(NDArray[np.uint8], cv2.blur(rgb, (SAMPLES, SAMPLES)))
     labels = None if labels is None else labels[rows, columns]
     return CameraImages(rgb[rows, columns], depth[rows, columns], labels)
 
