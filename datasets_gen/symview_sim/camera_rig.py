@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.lens import STORED
 from lerobot_symview.geometry.placement import CameraSpec
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.depth_sensor import degrade
@@ -82,9 +84,8 @@ class CameraRig:
             if spec.varies or not self._placed:
                 self.cameras[spec.name] = self._place(spec, pose_rng)
             camera = self.cameras[spec.name]
-            self._stated[spec.name] = (
-                spec.miscalibration.stated(camera, calibration_rng) if spec.miscalibration else camera
-            )
+            stated = spec.miscalibration.stated(camera, calibration_rng) if spec.miscalibration else camera
+            self._stated[spec.name] = stated if spec.distortion_known else replace(stated, lens=None)
             self._recent[spec.name] = deque(maxlen=spec.delay + 1)
         self._placed = True
 
@@ -104,6 +105,8 @@ class CameraRig:
                 observation["pixels"][_camera_name(keys.segmentation(name))] = labels
             observation[_env_key(keys.intrinsics(name))] = camera.intrinsics.ravel().astype(np.float32)
             observation[_env_key(keys.world_from_cam(name))] = camera.world_from_cam.ravel().astype(np.float32)
+            if camera.lens is not None:
+                observation[_env_key(keys.distortion(name))] = camera.lens.stored().astype(np.float32)
         return observation
 
     def spaces(self) -> dict[str, gymnasium.Space[Any]]:
@@ -111,7 +114,8 @@ class CameraRig:
         box = gymnasium.spaces.Box
         pixels: dict[str, gymnasium.Space[Any]] = {}
         spaces: dict[str, gymnasium.Space[Any]] = {}
-        for name, camera in self.cameras.items():
+        for spec in self._specs:
+            name, camera = spec.name, self.cameras[spec.name]
             shape = (camera.height, camera.width)
             pixels[name] = box(0, 255, (*shape, 3), np.uint8)
             if self._segmentation:
@@ -120,6 +124,8 @@ class CameraRig:
                 spaces[_env_key(keys.depth(name))] = box(0, np.inf, (1, *shape), np.float32)
             spaces[_env_key(keys.intrinsics(name))] = box(-np.inf, np.inf, (9,), np.float32)
             spaces[_env_key(keys.world_from_cam(name))] = box(-np.inf, np.inf, (16,), np.float32)
+            if spec.states_lens:
+                spaces[_env_key(keys.distortion(name))] = box(-np.inf, np.inf, (STORED,), np.float32)
         return spaces | {"pixels": gymnasium.spaces.Dict(pixels)}
 
     def _sensed(self, spec: CameraSpec) -> CameraImages:

@@ -203,7 +203,7 @@ def _features(env: TableEnv, config: GenerateConfig) -> Features:
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
     }
     for spec in env.specs:
-        shown = {"depth": config.env.depth, "segmentation": config.env.has_labels}
+        shown = {"depth": config.env.depth, "segmentation": config.env.has_labels, "lens": spec.states_lens}
         features |= camera_features(spec.name, spec.height, spec.width, env.workspace, **shown)
     if config.env.has_wrist_camera:
         features[keys.rgb(keys.WRIST)] = color_feature(WRIST_SIZE, WRIST_SIZE, {"fixed_to": "gripper"})

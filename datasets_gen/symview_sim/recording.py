@@ -29,6 +29,7 @@ import pyarrow.parquet as pq
 
 from lerobot_symview.datasets.features import Features
 from lerobot_symview.datasets.metadata import EPISODE_STYLE, RECORDING
+from lerobot_symview.geometry.placement import described
 from lerobot_symview.runtime.staging import DATASET, disk_errors, part_of, plain
 from symview_sim.demonstration import EpisodeFrames, demonstrate
 from symview_sim.settings import WorldSettings
@@ -74,6 +75,8 @@ class Recording:
         """Return everything that determines the data, as JSON values."""
         content = asdict(self)
         del content["folder"]
+        content["env"]["camera"] = described(self.env.camera)
+        content["env"]["more_cameras"] = [described(spec) for spec in self.env.more_cameras]
         versions = {"symview": version("lerobot_policy_symview")}
         versions |= {package: version(package) for package in self.env.packages}
         return plain(content | versions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import TRIES, CameraSpec
 from lerobot_symview.geometry.visibility import table_rays
 from lerobot_symview.geometry.workspace import Workspace
+from symview_sim.lens import through_lens
 from symview_sim.rendering import render
 
 LEAST_SEEN = 0.3  # fraction of the workspace: a camera that sees less shows the arm and makes empty views
@@ -51,6 +53,6 @@ def seen_fraction(client: Any, camera: Camera, workspace: Workspace) -> float:
     """Return the fraction of the workspace's pixels in a camera's image that do not show the robot; 0 without any."""
     camera = camera.resized(PIXELS)
     _, _, inside = table_rays(camera, workspace)
-    labels = render(client, camera, labelled=True).labels
+    labels = through_lens(partial(render, client, labelled=True), camera).labels
     assert labels is not None
     return float((labels[inside] != ROBOT).mean()) if inside.any() else 0.0

@@ -259,8 +259,7 @@ class _Reporter:
 
     def _frame(self, features: Observation, camera: str) -> Frame:
         rgb, depth = features[keys.rgb(camera)], features.get(keys.depth(camera))
-        calibrated = stored_camera(
-            features[keys.intrinsics(camera)], features[keys.world_from_cam(camera)], rgb.shape[0], rgb.shape[1]
-        )
+        numbers = {keys.parameter(key): features[key] for key in keys.calibration(camera, features)}
+        calibrated = stored_camera(height=rgb.shape[0], width=rgb.shape[1], **numbers)
         gripper = None if self._columns is None else poses_from_states(features[keys.STATE], self._columns)
         return Frame(rgb, None if depth is None else depth[..., 0], calibrated, self._workspace, gripper)

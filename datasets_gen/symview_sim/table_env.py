@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.camera_rig import CameraImages, CameraRig, EnvObservation
+from symview_sim.lens import pinhole_camera, through_lens
 from symview_sim.settings import WorldSettings
 
 RENDER_HEIGHT = 256  # pixels
@@ -22,10 +24,10 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     """A table seen by freely placed RGBD cameras, and a gripper over it.
 
     Observation: `pixels[<camera>]` uint8 (H, W, 3); `images.<camera>_depth` float32 (1, H, W), metres along the optical
-    axis, 0 = invalid; as the calibration states them, `camera.<camera>.intrinsics` float32 (9,), pixels, row-major, and
-    `camera.<camera>.world_from_cam` float32 (16,), row-major; `agent_pos` float32, the gripper's state, with x and y
-    relative to the workspace's centre. With `segmentation`, `pixels[<camera>_segmentation]` uint8 (H, W, 3), the same
-    label in each channel.
+    axis, 0 = invalid; as the calibration states them, `camera.<camera>.intrinsics` float32 (9,), pixels, row-major,
+    `camera.<camera>.world_from_cam` float32 (16,), row-major, and of a lens `camera.<camera>.distortion` float32 (9,),
+    as `Lens.stored` returns; `agent_pos` float32, the gripper's state, with x and y relative to the workspace's centre.
+    With `segmentation`, `pixels[<camera>_segmentation]` uint8 (H, W, 3), the same label in each channel.
 
     Args:
         settings: task, workspace, cameras and limits.
@@ -35,7 +37,8 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         render_mode: `rgb_array` (or None); `render()` returns the first camera's image.
 
     Raises:
-        CalibrationError: if a camera's image contains less than 60 % of the working volume.
+        CalibrationError: if a camera's image contains less than 60 % of the working volume, or its lens is too wide to
+            be rendered.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  gymnasium's own form
@@ -55,7 +58,9 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
         self._max_episode_steps = settings.episode_steps  # LeRobot reads it under this name
         self.specs = settings.all_cameras
         shown = {"depth": settings.depth, "segmentation": settings.has_labels}
-        self._rig = CameraRig(self.specs, self.workspace, self._draw, self._place, **shown)
+        self._rig = CameraRig(self.specs, self.workspace, self._see, self._place, **shown)
+        for camera in self._rig.cameras.values():
+            pinhole_camera(camera)  # raises now for a lens that is too wide, not in the first reset
         self._action_low, self._action_high = action_low, action_high
         self.action_space = gymnasium.spaces.Box(action_low, action_high)
         state = gymnasium.spaces.Box(-np.inf, np.inf, (len(settings.state_names),), np.float32)
@@ -82,11 +87,15 @@ class TableEnv(gymnasium.Env[EnvObservation, NDArray[np.float32]]):
     def render(self) -> NDArray[np.uint8]:
         """Return the first camera's image, (256, W, 3) uint8."""
         spec = self.specs[0]
-        return self._draw(spec, self.cameras[spec.name].resized(RENDER_HEIGHT)).rgb
+        return self._see(spec, self.cameras[spec.name].resized(RENDER_HEIGHT)).rgb
+
+    def _see(self, spec: CameraSpec, camera: Camera) -> CameraImages:
+        """Return what a camera sees now, through its lens if it has one."""
+        return through_lens(partial(self._draw, spec), camera)
 
     @abstractmethod
     def _draw(self, spec: CameraSpec, camera: Camera) -> CameraImages:
-        """Return what a camera sees now."""
+        """Return what a pinhole camera sees now."""
 
     def _place(self, spec: CameraSpec, rng: np.random.Generator) -> Camera:
         """Return the camera of an episode."""

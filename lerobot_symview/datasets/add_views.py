@@ -33,7 +33,7 @@ from lerobot_symview.datasets.view_derivation import ViewDerivation
 from lerobot_symview.geometry.gripper_state import REQUIRED
 from lerobot_symview.geometry.state_reader import StateOrigin, StateReader
 from lerobot_symview.geometry.units import parse_unit
-from lerobot_symview.geometry.visibility import check_camera
+from lerobot_symview.geometry.visibility import check_camera, detail
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation, check_repo_id, flagged, run_command
 from lerobot_symview.runtime.executors import EXECUTORS
@@ -292,13 +292,16 @@ def _check_names(config: AddViewsConfig, features: Features, added: Features) ->
 
 
 def _check_first_frame(derivation: ViewDerivation, source: SourceDataset) -> None:
-    """Render the first frame, so that errors that concern every frame are raised before anything is written."""
+    """Render the first frame, so that errors of every frame are raised before anything is written; log its detail."""
     reader = derivation.reader
     with flagged(f"--camera={derivation.camera}, --calibration, --depth_unit"):
         check_calibration(reader)
     frame = next(reader.frames(0, EpisodeTables(source, source.data_file(0), reader.columns()).read(0)))
     for view in derivation.views.values():
         view.render(frame)
+    sizes = {name: view.size for name, view in derivation.views.items()}
+    for name, one in {derivation.camera: frame, **frame.others}.items():
+        logger.info("%s", detail(name, one.camera, derivation.workspace, sizes))
 
 
 def _description(config: AddViewsConfig, derivation: ViewDerivation) -> dict[str, Any]:

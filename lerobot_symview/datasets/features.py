@@ -41,9 +41,16 @@ def metric_feature(height: int, width: int, meaning: dict[str, Any]) -> dict[str
 
 
 def camera_features(
-    name: str, height: int, width: int, workspace: Workspace, *, depth: bool = True, segmentation: bool = False
+    name: str,
+    height: int,
+    width: int,
+    workspace: Workspace,
+    *,
+    depth: bool = True,
+    segmentation: bool = False,
+    lens: bool = False,
 ) -> Features:
-    """Declare the colour image and calibration of one camera, and optionally its depth and segmentation."""
+    """Declare the colour image and calibration of one camera, and optionally its depth, segmentation and lens."""
     meaning = {"workspace": asdict(workspace)}
     features = {keys.rgb(name): color_feature(height, width, meaning)}
     if depth:
@@ -51,7 +58,7 @@ def camera_features(
     if segmentation:
         labels = {"labels": {"0": "table", "1": "robot", "2 and up": "objects"}}
         features[keys.segmentation(name)] = color_feature(height, width, meaning | labels)
-    return features | calibration_features(name)
+    return features | calibration_features(name, lens=lens)
 
 
 def calibration_features(name: str, *, lens: bool = False, depth_sensor: bool = False) -> Features:

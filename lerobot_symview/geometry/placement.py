@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from lerobot_symview.errors import OptionError
+from lerobot_symview.errors import CalibrationError, OptionError
 from lerobot_symview.geometry.camera import Array, Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.lens import Lens, lens_from_coefficients
 from lerobot_symview.geometry.miscalibration import Miscalibration
 from lerobot_symview.geometry.visibility import MINIMUM_VISIBLE, check_camera
 from lerobot_symview.geometry.workspace import Workspace
@@ -42,7 +44,7 @@ class CameraSpread:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole camera over the workspace, and the errors of its depth, its timing and its calibration.
+    """A camera over the workspace, and the errors of its depth, its timing and its calibration.
 
     Raises:
         OptionError: if values are invalid; the message lists them all.
@@ -70,6 +72,13 @@ class CameraSpec:
     """K in pixels, 9 numbers, row-major; replaces fov_deg."""
     world_from_cam: tuple[float, ...] | None = None
     """Pose, 16 numbers, row-major, metres, OpenCV axes; replaces the angles, distance and target."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of its lens, 4, 5 or 8 in OpenCV's order, such as `[-0.3, 0.1, 0, 0]`; by default it has no lens."""
+    distortion_model: str | None = None
+    """`plumb_bob`, `rational_polynomial` or `equidistant` (fisheye); by default it follows from the number of
+    coefficients."""
+    distortion_known: bool = True
+    """Whether the calibration that observations state has the lens."""
     sees_robot: bool = True
     """Whether the arm is rendered; False gives an oracle camera."""
     depth_noise: float = 0.0
@@ -114,8 +123,23 @@ class CameraSpec:
             problems.append(f"flying_pixels must lie in [0, 1], got {self.flying_pixels:g}")
         if not 0 <= self.delay <= MAX_DELAY:
             problems.append(f"delay must be 0 to {MAX_DELAY} actions, got {self.delay}")
+        try:
+            if self.lens is None and self.distortion_model is not None:
+                problems.append(f"distortion_model={self.distortion_model} needs distortion, got {self.distortion}")
+        except CalibrationError as error:
+            problems.append(f"distortion: {error}")
         if problems:
             raise OptionError(f"camera {self.name!r}: {'; '.join(problems)}")
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens; None for a pinhole camera."""
+        return lens_from_coefficients(self.distortion_model, self.distortion)
+
+    @property
+    def states_lens(self) -> bool:
+        """Whether the calibration that observations state has a lens."""
+        return self.distortion_known and self.lens is not None
 
     @property
     def varies(self) -> bool:
@@ -148,7 +172,7 @@ class CameraSpec:
 
     def _camera(self, workspace: Workspace, rng: np.random.Generator | None) -> Camera:
         spec = self if rng is None or not self.varies else self._sampled(rng)
-        return Camera(spec._intrinsics(), spec._pose(workspace), self.height, self.width)
+        return Camera(spec._intrinsics(), spec._pose(workspace), self.height, self.width, self.lens)
 
     def _sampled(self, rng: np.random.Generator) -> CameraSpec:
         spread = self.spread
@@ -171,6 +195,18 @@ class CameraSpec:
             return np.reshape(np.asarray(self.world_from_cam, dtype=np.float64), (4, 4))
         target = np.array([*workspace.center, 0.0]) + self.target
         return orbit_pose(np.deg2rad(self.elevation_deg), np.deg2rad(self.azimuth_deg), self.distance, target)
+
+
+PINHOLE = {"distortion": (), "distortion_model": None, "distortion_known": True}
+"""The settings of a lens, as they are without one."""
+
+
+def described(spec: CameraSpec) -> dict[str, Any]:
+    """Return the settings of a camera, without those of a lens if it has none.
+
+    Recordings and results that are older than these settings remain valid.
+    """
+    return {name: value for name, value in asdict(spec).items() if spec.distortion or name not in PINHOLE}
 
 
 def top_camera(size: int, workspace: Workspace) -> CameraSpec:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 
@@ -162,3 +163,23 @@ def table_resolution(camera: Camera, workspace: Workspace) -> float:
         return 0.0
     moved = [project(points + step, camera)[0] - here for step in np.eye(3)[:2] * MILLIMETRE]
     return float(np.linalg.svd(np.stack(moved, axis=-1), compute_uv=False)[:, -1].min())
+
+
+def detail(name: str, camera: Camera, workspace: Workspace, sizes: Mapping[str, int]) -> str:
+    """Return how finely a camera shows the table, in words, beside the sizes of the views that are made of it.
+
+    Args:
+        name: the camera's name.
+        camera: the calibrated camera.
+        workspace: the square on the table that the views show.
+        sizes: rows of each view, by its name.
+    """
+    side = workspace_pixels(camera, workspace)
+    if side == np.inf:
+        return f"camera {name!r} has a corner of the workspace behind it"
+    mean, worst = side * MILLIMETRE / workspace.size, table_resolution(camera, workspace)
+    drawn = ", ".join(f"{view} has {size}" for view, size in sizes.items())
+    return (
+        f"camera {name!r} has {mean:.2g} pixels a millimetre on the table, at worst {worst:.2g}: it fills a view of "
+        f"{side:.0f} x {side:.0f} pixels, {drawn}"
+    )

@@ -76,8 +76,6 @@ def run_command[Config](
     `short` maps abbreviated flags to full flags. Exit codes: 0 success, 2 invalid flag, 1 other errors, 130
     interrupted. Errors that a user can correct are printed as one line on stderr.
     """
-    import draccus
-
     program = Path(sys.argv[0]).name
     if "--version" in sys.argv[1:]:
         from importlib.metadata import version
@@ -93,7 +91,7 @@ def run_command[Config](
     usage_errors = io.StringIO()
     try:
         with redirect_stderr(usage_errors):
-            config = draccus.parse(config_class)
+            config = _parsed(config_class)
     except SystemExit as end:  # argparse printed help, or usage and then the error of an unknown flag
         if end.code:
             _end(program, unknown_flags(usage_errors.getvalue()), USAGE)
@@ -109,6 +107,17 @@ def run_command[Config](
     except KeyboardInterrupt:
         _end(program, "interrupted", INTERRUPTED)
     sys.exit(0)
+
+
+def _parsed[Config](config_class: type[Config]) -> Config:
+    """Parse the command line as `draccus.parse` does, but a boolean flag needs no value: `--resume` is true."""
+    from draccus.argparsing import ArgumentParser
+
+    parser: ArgumentParser[Config] = ArgumentParser(config_class)
+    for action in parser.parser._actions:
+        if action.type is bool:
+            action.nargs, action.const = "?", "true"
+    return parser.parse_args()
 
 
 def subcommand(kind: str, known: Mapping[str, object], default: str = "") -> str:

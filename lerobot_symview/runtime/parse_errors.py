@@ -23,6 +23,8 @@ def unknown_flags(argparse_output: str) -> str:
         argparse_output: the usage, which lists the known flags, and the error.
     """
     usage, _, reason = argparse_output.strip().rpartition("error: ")
+    if found := re.fullmatch(r"argument (\S+): expected one argument", reason):
+        return f"{found[1]} needs a value: write {found[1]}=value"
     given = reason.removeprefix("unrecognized arguments: ")
     if given == reason:
         return reason

@@ -25,7 +25,7 @@ from lerobot_symview.calibration.file import parse_calibration, parse_workspace
 from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.gripper_state import poses_from_states
 from lerobot_symview.geometry.units import METRES, parse_unit
-from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera
+from lerobot_symview.geometry.visibility import LEAST_VISIBLE, check_camera, detail
 from lerobot_symview.views import Frame, View, ViewSpec, make_views, other_cameras
 
 if TYPE_CHECKING:
@@ -184,14 +184,16 @@ class ViewsProcessorStep(ObservationProcessorStep):
         return keys.as_camera(observation, self.camera, others[0], features)
 
     def _check(self, batches: dict[str, FrameBatch]) -> None:
-        """Raise a CalibrationError if the first frame contradicts a camera's calibration; report how cameras agree."""
+        """Raise a CalibrationError if the first frame contradicts a calibration; log detail and how cameras agree."""
         from lerobot_symview.calibration.agreement import report_agreement
         from lerobot_symview.calibration.table_plane import check_table, has_depth
 
+        sizes = {name: view.size for name, view in self._views.items()}
         depths: dict[str, NDArray[np.floating]] = {}
         for name, batch in batches.items():
             camera = batch.cameras[0]
             check_camera(name, camera, self._workspace, minimum=LEAST_VISIBLE)
+            logger.info("%s", detail(name, camera, self._workspace, sizes))
             if batch.depth is None:
                 continue
             key, depths[name] = keys.depth(name), batch.depth[0].cpu().numpy()

@@ -98,6 +98,12 @@ WRONG = {
         "camera.spread.target": (NAN, "env.*camera.*spread must be finite and not negative.*target=nan"),
         "camera.intrinsics": ([1.0], "env.*camera.*intrinsics must be 9 numbers, got 1"),
         "camera.world_from_cam": ([1.0], "env.*camera.*world_from_cam must be 16 numbers, got 1"),
+        "camera.distortion": (
+            [0.1],
+            "env.*camera.*distortion: the lens model plumb_bob has 4 or 5 coefficients, got 1",
+        ),
+        "camera.distortion_model": ("plumb_bob", r"env.*camera.*distortion_model=plumb_bob needs distortion, got \(\)"),
+        "camera.distortion_known": ("perhaps", "camera.distortion_known.*'perhaps'"),
         "camera.sees_robot": ("perhaps", "camera.sees_robot.*'perhaps'"),
         "camera.depth_noise": (-1.0, "env.*camera.*depth_noise must not be negative, got -1"),
         "camera.depth_dropout": (2.0, r"env.*camera.*depth_dropout must lie in \[0, 1\], got 2"),

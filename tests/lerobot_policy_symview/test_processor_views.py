@@ -358,6 +358,14 @@ def test_images_of_another_size_than_calibrated_raise(observed):
         step.observation(without_calibration(small))
 
 
+def test_the_detail_of_the_camera_is_logged_once(observed, caplog):
+    caplog.set_level("INFO")
+    step = ViewsProcessorStep(views=[{"name": "reproj", "size": 32}])
+    for _ in range(2):
+        step.observation(dict(observed))
+    assert caplog.text.count("it fills a view of 73 x 73 pixels, reproj has 32") == 1
+
+
 @pytest.mark.parametrize("name", ["reproj", "persp"])
 def test_a_view_that_turns_black_warns_once_or_raises(observed, name, caplog):
     """The first frame is right; then the lens is covered, or depth has no valid pixel."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lerobot_symview.geometry.camera import Camera, invert_rigid
 from lerobot_symview.geometry.placement import CameraSpec
 from symview_sim.camera_rig import CameraImages, EnvObservation
+from symview_sim.lens import pinhole_camera
 from symview_sim.table_env import RENDER_HEIGHT, TableEnv
 from symview_sim.worlds.base import MujocoSettings, MujocoWorld
 
@@ -92,6 +93,7 @@ class MujocoEnv(TableEnv):
             from symview_sim.worlds.rendering import MujocoRenderer
 
             resized = self.cameras[self.specs[0].name].resized(RENDER_HEIGHT)
-            sizes = [(other.height, other.width) for other in (*self.cameras.values(), resized)]
+            drawn = map(pinhole_camera, (*self.cameras.values(), resized))
+            sizes = [(other.height, other.width) for other in drawn]
             self._renderer = MujocoRenderer(self.world.model, *map(max, zip(*sizes, strict=True)))
         return self._renderer.render(self.world.data, camera, self._model_from_world)

@@ -31,7 +31,7 @@ EXAMPLES = """\
   symview-experiment table1 --tasks='[block_picking]' --methods='[reproj_equi, sideview_equi]' --demos='[10]'
   symview-experiment figure7 --scale=paper --device=cuda --num_workers=2
   symview-experiment chunks --tasks='[block_picking]' --demos='[10, 100]' --seeds='[0]'
-  symview-experiment all --scale=laptop --num_workers=1 --dry_run=true
+  symview-experiment all --scale=laptop --num_workers=1 --dry_run
   symview-experiment report
 
 The first argument is the experiment (table1 to table5, figure5 to figure7, transfer, robustness, hidden, metaworld,

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_symview.geometry.placement import CameraSpec
+from lerobot_symview.geometry.placement import CameraSpec, described
 from lerobot_symview.registry import lookup
 from symview_eval.experiments.rows import MethodRow
 from symview_eval.experiments.scale import Algorithm, ChunkTraining, Scale
@@ -122,7 +122,9 @@ class Cell:
             **({"placed": [camera.azimuth_deg, camera.distance]} if _is_placed(camera) else {}),
             **({"spread": asdict(camera.spread)} if camera.varies else {}),
             **({} if camera.sees_robot else {"sees_robot": False}),
-            **({"more_cameras": [asdict(other) for other in self.row.more_cameras]} if self.row.more_cameras else {}),
+            **(
+                {"more_cameras": [described(other) for other in self.row.more_cameras]} if self.row.more_cameras else {}
+            ),
             "task": self.task,
             "demonstrations": self.demonstrations,
             "seed": self.seed,
@@ -142,7 +144,7 @@ class Cell:
 
         Cells of two tables with equal hashes share one run.
         """
-        cameras = {name: asdict(camera) for name, camera in self.placements}
+        cameras = {name: described(camera) for name, camera in self.placements}
         episodes = self.scale.placement_episodes
         return _hash(self.training | {"placements": cameras, "episodes": episodes}) if cameras else self.training_hash
 

@@ -31,20 +31,22 @@ def plot(experiment: Experiment, scale: str, entries: Sequence[TableEntry]) -> F
 
 def plot_placements(experiment: Experiment, scale: str, entries: Sequence[PlacementEntry]) -> Figure:
     """Return the success rate of every method with every camera as a coloured table, one panel for each task."""
+    names = [name for name, _ in experiment.placements]
     tasks = list(dict.fromkeys((entry.task, entry.demonstrations) for entry in entries))
     heights = [sum((entry.task, entry.demonstrations) == task for entry in entries) for task in tasks]
     figure = Figure(figsize=(13, 1.6 + 0.32 * sum(heights) + 1.4 * len(tasks)), layout="constrained")
     axes = figure.subplots(len(tasks), 1, squeeze=False, height_ratios=heights).flatten()
     for (task, demonstrations), axis in zip(tasks, axes, strict=True):
         rows = [entry for entry in entries if (entry.task, entry.demonstrations) == (task, demonstrations)]
-        rates = [[100 * rate.mean for rate in entry.rates.values()] for entry in rows]
+        rates = [
+            [100 * entry.rates[name].mean if name in entry.rates else math.nan for name in names] for entry in rows
+        ]
         axis.imshow(rates, cmap="viridis", vmin=0, vmax=100, aspect="auto")
         for y, line in enumerate(rates):
             for x, rate in enumerate(line):
-                axis.text(
-                    x, y, f"{rate:.0f}", ha="center", va="center", fontsize=8, color="white" if rate < 60 else "black"
-                )
-        axis.set_xticks(range(len(rates[0])), list(rows[0].rates), rotation=35, ha="right", fontsize=8)
+                shown = "" if math.isnan(rate) else f"{rate:.0f}"
+                axis.text(x, y, shown, ha="center", va="center", fontsize=8, color="white" if rate < 60 else "black")
+        axis.set_xticks(range(len(names)), names, rotation=35, ha="right", fontsize=8)
         axis.set_yticks(range(len(rows)), [f"{entry.row.label}, {_seeds(entry)}" for entry in rows], fontsize=8)
         episodes = rows[0].results[0].checkpoints[0].episodes
         about = f"success, %, mean over seeds of {episodes} episodes"

@@ -82,7 +82,7 @@ class PlacementEntry(Entry):
     """Success rates by camera."""
 
     rates: dict[str, Estimate]
-    """Success rate with each camera, by its name."""
+    """Success rate with each camera, by its name; results that are older than a camera lack it."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +122,12 @@ def placement_entries(experiment: Experiment, scale: str, folder: Path) -> list[
 
 
 def _by_camera(results: Sequence[Result]) -> dict[str, Estimate]:
-    names = [point.camera for point in results[0].checkpoints]
-    return {
-        name: _pooled([[point for point in result.checkpoints if point.camera == name] for result in results])
-        for name in names
-    }
+    """Return the rate with each camera, over the seeds that have it."""
+    points: dict[str, list[list[Checkpoint]]] = {}
+    for result in results:
+        for point in result.checkpoints:
+            points.setdefault(point.camera, []).append([point])
+    return {name: _pooled(seeds) for name, seeds in points.items()}
 
 
 def _grouped(experiment: Experiment, scale: str, folder: Path) -> dict[tuple[MethodRow, str, int], tuple[Result, ...]]:

@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 from lerobot_symview import keys
 from lerobot_symview.datasets.metadata import RECORDING, read_settings
 from lerobot_symview.datasets.source import SourceDataset
+from lerobot_symview.geometry.placement import PINHOLE
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation
 from lerobot_symview.runtime.staging import plain
 from symview_sim.settings import EnvSettings
@@ -64,7 +65,11 @@ def check_scene(dataset: Any, env: EnvSettings, camera: str, merged: Sequence[st
         raise ValueError(f"the policy's view merges {', '.join(missing)}: give --env.more_cameras")
     info = dataset.meta.features.get(keys.rgb(camera), {}).get("info") or {}
     recorded = read_settings(Path(dataset.root), RECORDING).get("env", {})
-    cameras = {spec["name"]: spec for spec in (recorded["camera"], *recorded["more_cameras"])} if recorded else {}
+    cameras = (
+        {spec["name"]: plain(PINHOLE) | spec for spec in (recorded["camera"], *recorded["more_cameras"])}
+        if recorded
+        else {}
+    )
     pairs: dict[str, tuple[Any, Any]] = {}
     for flag, ours, theirs in (
         ("--env", {"task": env.task, "robot": env.robot, "control": env.control}, recorded),

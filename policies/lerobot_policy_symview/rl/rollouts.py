@@ -115,9 +115,11 @@ def simulator_config(config: SymviewConfig, env: WorldSettings) -> SimulatorConf
             f"--policy.state_symmetry={config.state_symmetry} does not fit the simulators' state, which is "
             f"[{', '.join(names)}]"
         )
+    scene = make_scene_input(config, parse_workspace(config.workspace))
+    lenses = [keys.distortion(spec.name) for spec in env.all_cameras if spec.states_lens]
     return SimulatorConfig(
         env=env,
-        names=(*make_scene_input(config, parse_workspace(config.workspace)).keys, *filter(None, [wrist])),
+        names=(*scene.keys, *(key for key in scene.optional_keys if key in lenses), *filter(None, [wrist])),
         views=tuple(config.views_to_make),
         camera=config.camera,
         workspace=config.workspace,

@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import sys
 from dataclasses import dataclass
@@ -233,7 +234,9 @@ def test_without_gripper_dimensions_views_are_unclipped_and_have_no_gripper_imag
     source = tmp_path / "joints"
     shutil.copytree(recorded, source)
     change_feature(source, keys.STATE, names=[f"joint_{i}" for i in range(5)])
+    caplog.set_level("INFO")
     result = add_views(views_config(source, tmp_path / "views"))
+    assert re.search(r"it fills a view of \d+ x \d+ pixels, reproj has \d+, persp has \d+", caplog.text)
     assert "rendered without clipping at the gripper" in caplog.text
     features = SourceDataset(result).features
     assert keys.view("side", "persp_gripper") not in features

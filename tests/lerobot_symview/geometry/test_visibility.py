@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera, invert_rigid
+from lerobot_symview.geometry.camera import Camera, invert_rigid, orbit_pose
 from lerobot_symview.geometry.visibility import (
     AXES,
     camera_problem,
     check_camera,
+    detail,
     read_differently,
     sound_readings,
     workspace_pixels,
@@ -87,3 +88,17 @@ def test_pixels_of_the_workspace_of_a_camera_above_it():
     """Known answer: 0.4 m at a distance of 0.81 m with a focal length of f pixels are 0.4 f / 0.81 pixels."""
     camera = make_camera(90)
     assert workspace_pixels(camera, WORKSPACE) == pytest.approx(0.4 * camera.fx / 0.81)
+
+
+def test_the_detail_of_a_camera_above_the_workspace_is_the_same_everywhere():
+    """152 pixels of 48 degrees at 0.81 m: 0.21 pixels a millimetre, 84 of 0.4 m."""
+    assert detail("front", make_camera(90), WORKSPACE, {"reproj": 152, "persp": 76}) == (
+        "camera 'front' has 0.21 pixels a millimetre on the table, at worst 0.21: "
+        "it fills a view of 84 x 84 pixels, reproj has 152, persp has 76"
+    )
+    assert "at worst 0.11: it fills a view of 73 x 73 pixels" in detail("side", make_camera(45), WORKSPACE, {})
+
+
+def test_a_camera_over_the_workspace_may_have_a_corner_of_it_behind():
+    low = orbit_pose(np.deg2rad(20), 0.0, 0.15, (0.45, 0.0, 0.0))
+    assert "has a corner of the workspace behind it" in detail("front", with_pose(low), WORKSPACE, {})

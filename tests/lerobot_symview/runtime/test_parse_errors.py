@@ -1,5 +1,6 @@
 """What a terminal shows for a wrong flag, of configurations of every kind."""
 
+import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,6 +70,8 @@ CASES = {
     "--sise=4": "unknown flag --sise; did you mean --size?",
     "--env.oracel=true": "unknown flag --env.oracel; did you mean --env.oracle?",
     "--entirely=different": "unknown flag --entirely",
+    "--size": "--size needs a value: write --size=value",
+    "--resume perhaps": "--resume must be true or false, got 'perhaps'",
     "--size=two": "--size must be an integer, got 'two'",
     "--size=2.5": "--size must be an integer, got '2.5'",
     "--rate=fast": "--rate must be a number, got 'fast'",
@@ -91,12 +94,31 @@ CASES = {
 
 @pytest.mark.parametrize(("flags", "shown"), CASES.items(), ids=list(CASES))
 def test_the_terminal_shows_one_line_with_flag_value_and_expectation(flags, shown, monkeypatch, capsys):
-    flags = flags.split(" --")
-    monkeypatch.setattr(sys, "argv", ["example", *GOOD, flags[0], *(f"--{flag}" for flag in flags[1:])])
+    monkeypatch.setattr(sys, "argv", ["example", *GOOD, *re.split(r" (?=--|perhaps)", flags)])
     with pytest.raises(SystemExit) as end:
         run_command(Config, pytest.fail, "")
     assert end.value.code == 2
     assert capsys.readouterr().err == f"example: error: {shown}\n"
+
+
+@pytest.mark.parametrize(
+    ("flags", "resume", "oracle"),
+    [
+        (["--resume"], True, True),
+        (["--resume", "--size=3"], True, True),
+        (["--resume", "false"], False, True),
+        (["--resume=false", "--env.oracle"], False, True),
+        (["--env.oracle=false"], False, False),
+    ],
+    ids=str,
+)
+def test_a_boolean_flag_without_a_value_is_true(flags, resume, oracle, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["example", *GOOD, *flags])
+    parsed = []
+    with pytest.raises(SystemExit) as end:
+        run_command(Config, parsed.append, "")
+    assert end.value.code == 0
+    assert (parsed[0].resume, parsed[0].env.oracle, parsed[0].size) == (resume, oracle, 3)
 
 
 def test_a_missing_flag_is_named(monkeypatch, capsys):

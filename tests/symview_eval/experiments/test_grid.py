@@ -1,10 +1,12 @@
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from symview_eval.experiments.actors import policy_config, sight
 from symview_eval.experiments.grid import select
+from symview_eval.experiments.results import read_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import paper_values
 from symview_eval.experiments.tables import EXPERIMENTS
@@ -87,6 +89,13 @@ def test_equal_cells_of_two_tables_share_a_configuration():
     assert shared == single_cell("figure7", "block_stacking", "reproj_equi_45deg").configuration_hash
     assert shared != single_cell("figure7", "block_stacking", "reproj_equi_30deg").configuration_hash
     assert shared != single_cell("table4", "block_stacking", "reproj_equi_local").configuration_hash
+
+
+def test_a_setting_that_pinhole_cameras_do_not_have_leaves_finished_results_valid():
+    """A new option of cameras must not make the evaluations of other placements run again."""
+    cell = single_cell("transfer", "block_picking", "persp_equi")
+    finished = read_result(Path(__file__).parents[3] / "results" / cell.path)
+    assert cell.configuration_hash == finished.origin.configuration
 
 
 def test_methods_share_demonstrations():

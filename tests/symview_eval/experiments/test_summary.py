@@ -5,12 +5,14 @@ import pytest
 
 from symview_eval.experiments.grid import select
 from symview_eval.experiments.plots import plot
+from symview_eval.experiments.report import ReportConfig, report
 from symview_eval.experiments.results import Checkpoint, write_result
 from symview_eval.experiments.scale import SCALES
 from symview_eval.experiments.summary import (
     is_current,
     method_pairs,
     order_probability,
+    placement_entries,
     scales_with_results,
     table_entries,
 )
@@ -37,6 +39,24 @@ def test_best_last_and_mean_of_the_last_five(tmp_path):
     assert entry.episodes == 200
     assert entry.paper == pytest.approx(0.847)
     assert entry.difference == pytest.approx(0.9 - 0.847)
+
+
+def test_a_camera_that_older_results_lack_is_shown_where_it_is_known(tmp_path):
+    """The report is made of both, and says how many rows are of other settings."""
+    experiment = EXPERIMENTS["robustness"]
+    names = [name for name, _ in experiment.placements]
+    for method, seed, known in (("reproj_equi", 0, names[1:]), ("reproj_equi", 1, names), ("persp_equi", 0, names[:3])):
+        (cell,) = select(experiment, SCALE, ["block_picking"], [method], [10], [seed])
+        points = [Checkpoint(2000, 15, 20, 0.7, math.nan, "", name) for name in known]
+        configuration = cell.configuration_hash if known == names else "older"
+        write_result(tmp_path / cell.path, replace(result(configuration, seed=seed), checkpoints=points))
+    entries = placement_entries(experiment, "laptop", tmp_path)
+    assert [set(entry.rates) for entry in entries] == [set(names), set(names[:3])]
+    assert all(rate.mean == 0.75 for entry in entries for rate in entry.rates.values())
+    page = report(ReportConfig(tmp_path, tmp_path / "report")).with_suffix(".md").read_text()
+    assert "2 rows were computed with other settings" in page
+    widths = {line.count("|") for line in page.splitlines() if line.startswith("|")}
+    assert widths == {len(names) + 5}
 
 
 def test_the_interval_over_seeds(tmp_path):

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,23 @@ def test_the_expert_succeeds(task):
     assert all(success for *_, success in episodes)
     assert np.median([len(actions) for _, actions, _ in episodes]) <= EXPERTS[task] + 2
     env.close()
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_lens_bends_the_image_and_not_the_table(world):
+    lens = replace(SMALL, distortion=(-0.3, 0.1, 0.0, 0.0))
+    images, tables = [], []
+    for camera in (SMALL, lens):
+        env = settings_of(world, camera=camera).make()
+        observation, _ = env.reset(seed=0)
+        images.append(observation["pixels"]["side"])
+        heights = unproject(observation["images.side_depth"][0], env.cameras["side"])[..., 2]
+        tables.append(np.abs(heights) < 0.003)
+        assert env.render().shape == (256, 358, 3)
+        env.close()
+    assert images[0].shape == images[1].shape
+    assert (images[0] != images[1]).mean() > 0.1
+    assert tables[1].mean() > 0.8 * tables[0].mean() > 0.1
 
 
 @pytest.mark.parametrize("world", WORLDS)
