@@ -228,7 +228,7 @@ def ideal_pixels_batch(cameras: list[Camera], device: torch.device) -> tuple[Ten
 
 
 def _ideal_pixels_on(device: torch.device, optics: Optics) -> tuple[Tensor, Tensor]:
-    if torch.compiler.is_exporting() or torch.jit.is_tracing():  # type: ignore[no-untyped-call]
+    if torch.compiler.is_exporting() or torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
         return _copy_ideal_pixels(device, optics)  # a recorded tensor is of no use outside of its recording
     return _cached_ideal_pixels(device, optics)
 
