@@ -55,7 +55,7 @@ def take_images(device: Any, count: int = 1) -> list[NDArray[np.uint8]]:
     """
     try:
         return _images(device, count)
-    except (ImportError, RuntimeError) as error:  # LeRobot's cameras raise these, and OSError
+    except (ImportError, RuntimeError, OSError) as error:
         raise CommandError(f"--device: {error}") from None
 
 
