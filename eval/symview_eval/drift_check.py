@@ -1,6 +1,6 @@
 """`symview-preview --check`: whether a dataset's camera was moved between its episodes, and where it stands now.
 
-`--check_image` compares an image that the camera takes now.
+`--check_image` and `--device` compare an image that the camera takes now.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from lerobot_symview.errors import CalibrationError
 from lerobot_symview.geometry.camera import Camera
 from lerobot_symview.views import Frame
 from symview_eval.calibrate.output import replace_file
-from symview_eval.calibrate.photographs import from_files
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +80,7 @@ def check_drift(reader: FrameReader, output_dir: Path) -> list[EpisodeDrift]:
     return measured
 
 
-def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
+def check_image(reader: FrameReader, name: str, image: NDArray[np.uint8], output_dir: Path) -> Drift:
     """Compare an image that the camera takes now with the dataset, and report whether the camera was moved since.
 
     The reference is the first episode with the last episode's calibration, as in `check_drift`: the calibration is
@@ -89,13 +88,13 @@ def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
 
     Args:
         reader: of the camera's frames.
-        file: the image.
+        name: of the image, for messages.
+        image: (H, W, 3) uint8 RGB.
         output_dir: folder for `cameras.yaml`, written only if the camera was moved.
 
     Raises:
-        CalibrationError: if the file is no image, or shows something else.
+        CalibrationError: if the image shows something else.
     """
-    ((name, image),) = from_files(str(file)).items()
     count = len(reader.dataset.episodes)
     last = reader.frame(count - 1, 0)
     frames = ((index, reader.frame(index, 0)) for index in range(count))
@@ -103,13 +102,13 @@ def check_image(reader: FrameReader, file: Path, output_dir: Path) -> Drift:
     try:
         drift = image_drift(frame.rgb, image)
     except CalibrationError as error:
-        raise CalibrationError(f"{file} cannot be compared with episode {episode}: {error}") from None
+        raise CalibrationError(f"{name} cannot be compared with episode {episode}: {error}") from None
     length = drift.described(frame.camera, reader.workspace)
     if drift.pixels <= MOST_DRIFT:
-        logger.info("camera %r stands still: in %s its image has moved by %s", reader.camera, name, length)
+        logger.info("camera %r stands still: %s is shifted by %s", reader.camera, name, length)
         return drift
     logger.warning(
-        "camera %r was moved since episode %d: in %s its image by %s. Views of new images are displaced",
+        "camera %r was moved since episode %d: %s is shifted by %s. Views of new images are displaced",
         reader.camera,
         episode,
         name,

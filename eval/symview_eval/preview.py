@@ -31,9 +31,11 @@ from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError, DatasetLocation, flagged, run_command
 from lerobot_symview.runtime.view_flags import views_from_flags
 from lerobot_symview.views import Frame, PerspectiveView, ReprojectedView, View, ViewSpec
+from symview_eval.calibrate.photographs import from_files
 from symview_eval.contact_sheet import SheetRow, grey, montage, page, with_outline
 from symview_eval.drift_check import check_drift, check_image
 from symview_eval.gripper_path import GripperPath, read_path
+from symview_eval.live_camera import device_of, take_images, with_device
 from symview_eval.rerun_recording import RerunRecording
 
 logger = logging.getLogger(__name__)
@@ -43,7 +45,8 @@ EXAMPLES = """\
   symview-preview --dataset.repo_id=me/real --calibration=cameras.yaml --camera=front --episodes='[0, 7]' \\
       --reproj.source_scale=2 --output_dir=preview
   symview-preview --dataset.repo_id=me/real --camera=front --check=true
-  symview-preview --dataset.repo_id=me/real --camera=front --check_image=now.png"""
+  symview-preview --dataset.repo_id=me/real --camera=front --check_image=now.png
+  symview-preview --dataset.repo_id=me/real --camera=front --check=true --device.type=opencv --device.index_or_path=0"""
 LEAST_DETAIL = 0.2  # the camera's pixels per millimetre at worst, relative to the view's; in the paper's setup, 0.29
 SMALLEST_TRAINED = 76  # pixels of a view that a policy takes, with a crop of 64
 
@@ -96,7 +99,8 @@ class PreviewConfig:
     """Types of the action's dimensions, as for --policy.action_symmetry; by default those that its names say."""
     check: bool = False
     """Compare the first frames of all episodes: warn if the camera was moved between them, and write `cameras.yaml`,
-    the camera as it stands in the last of them."""
+    the camera as it stands in the last of them. With the flags of `--device.type`, a camera that LeRobot knows, compare
+    an image that it takes now."""
     check_image: Path | None = None
     """An image that the camera takes now, such as one of `lerobot-find-cameras`: warn if the camera was moved since its
     calibration, and write `cameras.yaml`."""
@@ -115,6 +119,8 @@ class PreviewConfig:
             raise ValueError("--episodes is empty: give at least one, such as --episodes='[0]'")
         if self.check and self.check_image is not None:
             raise ValueError("--check and --check_image both write cameras.yaml: give one of them")
+        if device_of(self) is not None and not self.check:
+            raise ValueError("--device takes an image to compare with the dataset: give --check=true beside it")
         if self.check_image is not None and not self.check_image.expanduser().is_file():
             raise ValueError(f"--check_image must be an image file, got {self.check_image}")
         if not 0 <= self.max_holes <= 1:
@@ -223,14 +229,25 @@ def preview(config: PreviewConfig) -> Path:
         logger.info("declared symmetry: %s", fact)
     logger.info("wrote %s", ", ".join(str(file) for file in sorted(config.output_dir.glob("preview.*"))))
     if reader is not None:
-        if config.check:
-            check_drift(reader, config.output_dir)
-        if config.check_image is not None:
-            with flagged("--check_image"):
-                check_image(reader, config.check_image, config.output_dir)
+        _check_camera(config, reader)
         with flagged(f"--camera={config.camera}, --calibration, --depth_unit"):
             check_calibration(reader)
     return config.output_dir
+
+
+def _check_camera(config: PreviewConfig, reader: FrameReader) -> None:
+    """Report whether the camera was moved, as far as the flags ask for it."""
+    device = device_of(config)
+    if config.check_image is not None:
+        with flagged("--check_image"):
+            ((name, image),) = from_files(str(config.check_image)).items()
+            check_image(reader, name, image, config.output_dir)
+    elif device is not None:
+        (image,) = take_images(device)
+        with flagged("--device"):
+            check_image(reader, "the live image", image, config.output_dir)
+    elif config.check:
+        check_drift(reader, config.output_dir)
 
 
 def _chosen(config: PreviewConfig, source: SourceDataset) -> tuple[FrameReader | None, dict[str, View]]:
@@ -357,4 +374,4 @@ def _displayable(image: NDArray) -> NDArray[np.uint8]:
 
 def main() -> None:
     """Run the console command."""
-    run_command(PreviewConfig, preview, EXAMPLES, short={"--root": "--dataset.root", **POSE_FLAGS})
+    run_command(with_device(PreviewConfig), preview, EXAMPLES, short={"--root": "--dataset.root", **POSE_FLAGS})

@@ -1,4 +1,7 @@
-"""Rerun recording of frames: camera frusta, point clouds, the workspace and the views (extra `viz`)."""
+"""Rerun recording of frames: camera frusta, point clouds, the workspace and the views (extra `viz`).
+
+Rerun knows pinhole cameras alone: images of a camera with a lens are shown undistorted.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_symview.geometry.camera import unproject
+from lerobot_symview.geometry.undistortion import undistorted
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import CommandError
 from lerobot_symview.views import Frame
@@ -63,7 +67,7 @@ class RerunRecording:
             resolution=[frame.camera.width, frame.camera.height],
             image_plane_distance=FRUSTUM,
         )
-        log(f"world/{camera}/image", pinhole, rerun.Image(frame.rgb))
+        log(f"world/{camera}/image", pinhole, rerun.Image(undistorted(frame.rgb, frame.camera)))
         if frame.depth is not None:
             depth = frame.depth
             seen = np.isfinite(depth) & (depth > 0)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from lerobot_symview.calibration.board import DICTIONARIES, Board, board_pattern, pixels_per_square
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Array, Camera, from_ideal
+from lerobot_symview.geometry.camera import Array, Camera
+from lerobot_symview.geometry.undistortion import undistorted
 
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "ARUCO_MIP_36h12",
             "APRILTAG_16h5", "APRILTAG_25h9", "APRILTAG_36h10", "APRILTAG_36h11")  # fmt: skip
@@ -98,9 +99,7 @@ def find_board_through_fisheye(image: NDArray[np.uint8], board: Board, camera: C
         board: the board that the image should show.
         camera: of the image; its pose does not matter.
     """
-    ideal = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)
-    u, v = np.moveaxis(from_ideal(ideal, camera), -1, 0).astype(np.float32)
-    return find_board(cv2.remap(image, u, v, cv2.INTER_LINEAR), board)
+    return find_board(undistorted(image, camera), board)
 
 
 def _spans_plane(corners: Corners, board: Board) -> bool:

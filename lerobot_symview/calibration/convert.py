@@ -37,6 +37,8 @@ def convert(
     size: Size | None = None,
     workspace: Workspace | None = None,
     reading: PoseReading | None = None,
+    *,
+    pose_needed: bool = True,
 ) -> dict[str, Any]:
     """Return the content of our own calibration file, from one file or from several that complete each other.
 
@@ -46,6 +48,7 @@ def convert(
         size: rows and columns of the camera's images, for files that do not say it, or have several.
         workspace: what the camera sees, to decide between readings of a pose.
         reading: how to read the pose, where its file does not say it or is wrong.
+        pose_needed: if not, the files may lack a pose, and one whose reading is to be found is left out.
 
     Raises:
         CalibrationError: if a file cannot be read, the files contradict each other, or something is missing.
@@ -53,7 +56,7 @@ def convert(
     documents = {Path(file): read_document(file) for file in files}
     if not documents:
         raise CalibrationError("no calibration file is given")
-    if len(documents) == 1:
+    if len(documents) == 1 and pose_needed:
         ((file, document),) = documents.items()
         if _format(document) is None:
             return _our_content(file, document)
@@ -75,11 +78,11 @@ def convert(
     camera = camera or (named[0] if named else "camera")
     if workspaces:
         workspace = parse_workspace(workspaces[0])
-    entries = _join(sources, camera, size)
+    entries = _join(sources, camera, size, pose_needed)
     if "depth_sensor" in entries:
         entries["depth_sensor"] = _scaled(entries["depth_sensor"], 1 / METRES.get(str(units), 1.0))
     pose = next(((source.file, source.pose) for source in sources if source.pose is not None), None)
-    if pose is not None:
+    if pose is not None and pose_needed:
         try:
             entries |= resolve(camera, entries, pose[1], reading or PoseReading(), workspace)
         except CalibrationError as error:
@@ -181,7 +184,7 @@ def _scaled(depth_sensor: Any, factor: float) -> Any:
     return entries
 
 
-def _join(sources: Sequence[_Source], camera: str, size: Size | None) -> dict[str, Any]:
+def _join(sources: Sequence[_Source], camera: str, size: Size | None, pose_needed: bool) -> dict[str, Any]:
     """Return the entries of all files, except the pose that is still to be read."""
     joined: dict[str, Any] = {}
     owner: dict[str, _Source] = {}
@@ -200,7 +203,7 @@ def _join(sources: Sequence[_Source], camera: str, size: Size | None) -> dict[st
     missing = []
     if "intrinsics" not in owner:
         missing.append(f"no intrinsics: add a file with K, such as {HAS_INTRINSICS}")
-    if "pose" not in owner:
+    if pose_needed and "pose" not in owner:
         missing.append(
             f"no pose of the camera in the robot's base or the world: add a file with it, such as {HAS_POSE}"
         )

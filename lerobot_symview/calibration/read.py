@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from lerobot_symview.calibration.convert import convert
-from lerobot_symview.calibration.file import Calibration, parse_calibration
+from lerobot_symview.calibration.file import POSES, Calibration, parse_calibration
 from lerobot_symview.calibration.readings import PoseReading
 from lerobot_symview.errors import CalibrationError
+from lerobot_symview.geometry.camera import Camera, orbit_pose
 from lerobot_symview.geometry.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
+ANY_POSE = orbit_pose(1.0, 0.0, 1.0, (0.0, 0.0, 0.0))
 OFF_CENTER = 0.2  # of the image's side: distance of the principal point from the middle
 
 
@@ -38,11 +41,32 @@ def read_calibration(
             all problems.
     """
     listed = [files] if isinstance(files, Path | str) else list(files)
-    content = convert(listed, camera, size, workspace, reading)
+    return _parsed(convert(listed, camera, size, workspace, reading), listed)
+
+
+def read_intrinsics(file: Path | str, camera: str, size: tuple[int, int] | None = None) -> Camera:
+    """Read a camera's image size, K, lens and depth sensor from a file that may lack its pose; the pose is arbitrary.
+
+    Args:
+        file: of our own format or of another tool.
+        camera: its name, in a file with several.
+        size: rows and columns of its images, for files that do not say it.
+
+    Raises:
+        CalibrationError: if the file cannot be read, its content is invalid, or intrinsics or image size are missing.
+    """
+    content = convert([file], camera, size, pose_needed=False)
+    ((name, entries),) = content["cameras"].items()
+    known = {key: value for key, value in entries.items() if key not in (*POSES, "quaternion_xyzw")}
+    calibration = _parsed(content | {"cameras": {name: known | {"world_from_cam": ANY_POSE.tolist()}}}, [file])
+    return calibration.camera(name)
+
+
+def _parsed(content: Mapping[str, Any], files: Sequence[Path | str]) -> Calibration:
     try:
         calibration = parse_calibration(content)
     except CalibrationError as error:
-        raise CalibrationError(f"{' and '.join(map(str, listed))}: {error}") from None
+        raise CalibrationError(f"{' and '.join(map(str, files))}: {error}") from None
     _warn_of_resized(calibration)
     return calibration
 

@@ -227,10 +227,18 @@ def ideal_pixels_batch(cameras: list[Camera], device: torch.device) -> tuple[Ten
     return u, v
 
 
-@lru_cache(maxsize=8)
 def _ideal_pixels_on(device: torch.device, optics: Optics) -> tuple[Tensor, Tensor]:
+    if torch.compiler.is_exporting() or torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
+        return _copy_ideal_pixels(device, optics)  # a recorded tensor is of no use outside of its recording
+    return _cached_ideal_pixels(device, optics)
+
+
+def _copy_ideal_pixels(device: torch.device, optics: Optics) -> tuple[Tensor, Tensor]:
     u, v = (torch.from_numpy(np.array(plane)).to(device) for plane in ideal_pixels(optics))
     return u, v
+
+
+_cached_ideal_pixels = lru_cache(maxsize=8)(_copy_ideal_pixels)
 
 
 def _ordered(values: Tensor) -> Tensor:

@@ -93,21 +93,36 @@ def test_strictly_exported_programs_match_the_policy(monkeypatch):
     assert_same_policy(program.module(), policy, monkeypatch)
 
 
-def test_a_configured_calibration_is_part_of_the_program():
-    observation = example_observation(make_policy(method="persp_equi_broken").config)
-    names = keys.intrinsics("side"), keys.world_from_cam("side")
-    k, pose = (observation.pop(name)[0] for name in names)
+@FIXED_SIZE
+@pytest.mark.parametrize(
+    ("method", "distortion"),
+    [
+        ("persp_equi_broken", []),
+        ("sideview_plucker", [-0.1, 0.02, 0.001, 0.0]),
+        ("voxel_equi", [-0.1, 0.02, 0.0, 0.001]),
+    ],
+)
+def test_a_configured_calibration_is_part_of_the_policy(method, distortion):
+    """Recorded before the policy has run: what is recorded of a lens must not stay in the policy."""
+    observation = example_observation(make_policy(method=method).config)
+    names = keys.calibration("side")
+    k, pose = (observation.pop(name)[0] for name in keys.calibration("side", ()))
+    height, width = observation[keys.rgb("side")].shape[-2:] if keys.rgb("side") in observation else (480, 640)
     side = {
-        "width": 640,
-        "height": 480,
+        "width": width,
+        "height": height,
         "intrinsics": k.view(3, 3).tolist(),
         "world_from_cam": pose.view(4, 4).tolist(),
+        "distortion": distortion,
     }
-    policy = make_policy(method="persp_equi_broken", calibration={"units": "m", "cameras": {"side": side}})
+    policy = with_biases(make_policy(method=method, calibration={"units": "m", "cameras": {"side": side}}))
+    observation = {key: values for key, values in observation.items() if key in policy.scene.keys}
     program = export_policy(policy, observation)
     (example,), _ = program.example_inputs
     assert not set(names) & set(example)
-    torch.testing.assert_close(program.module()(example), policy.select_action(example), rtol=0, atol=1e-5)
+    traced = torch.jit.trace(PolicyModule(policy), (example,))
+    for again in (program.module(), traced):
+        torch.testing.assert_close(again(example), policy.select_action(example), rtol=0, atol=1e-5)
 
 
 @FIXED_SIZE

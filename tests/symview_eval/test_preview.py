@@ -1,25 +1,33 @@
 import logging
 import re
+import sys
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pytest
 import yaml
+from lerobot.cameras import Camera as Device
+from lerobot.cameras import CameraConfig
 from lerobot.datasets import LeRobotDataset, merge_datasets
 
+import tests.symview_eval as this_package
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
 from lerobot_symview.datasets.source import SourceDataset
 from lerobot_symview.errors import CalibrationError, SymviewError
 from lerobot_symview.geometry.camera import Camera, intrinsics_from_fov, orbit_pose
+from lerobot_symview.geometry.lens import EQUIDISTANT, Lens
 from lerobot_symview.geometry.placement import CameraSpec, CameraSpread
+from lerobot_symview.geometry.undistortion import undistorted
 from lerobot_symview.geometry.visibility import table_resolution
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import DatasetLocation
-from lerobot_symview.views import make_view
+from lerobot_symview.views import Frame, make_view
 from symview_eval.contact_sheet import OUTLINE, png_uri, with_outline
-from symview_eval.preview import PreviewConfig, preview, read_samples
+from symview_eval.preview import PreviewConfig, main, preview, read_samples
+from symview_eval.rerun_recording import RerunRecording
 from symview_sim.generate import GenerateConfig, RecordedEnv, generate
 from symview_sim.settings import NewDataset
 from tests.helpers.boards import K, pose_errors
@@ -162,15 +170,39 @@ def test_a_recording_has_points_and_stored_views(with_views, tmp_path):
     assert {"/world/points", "/views/side_reproj", "/views/side_reproj_height", "/views/side_persp"} <= paths
 
 
+def test_a_recording_shows_the_image_without_the_distortion_of_the_lens(tmp_path):
+    from rerun.experimental import RrdReader
+
+    camera = Camera(K, orbit_pose(0.8, 0.3, 0.9, TABLE), 480, 640, Lens(EQUIDISTANT, (0.05, -0.01, 0.002, 0.0)))
+    rgb = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    recording = RerunRecording(tmp_path / "preview.rrd", Workspace())
+    recording.add(0, "front", Frame(rgb, None, camera, Workspace(), None), {})
+    recording.close()
+    columns = {
+        name: batch.column(name)
+        for chunk in RrdReader(tmp_path / "preview.rrd").stream()
+        if chunk.entity_path == "/world/front/image"
+        for batch in [chunk.to_record_batch()]
+        for name in batch.schema.names
+    }
+    shown = np.array(columns["Image:buffer"][0].as_py()).reshape(rgb.shape)
+    np.testing.assert_array_equal(shown, undistorted(rgb, camera))
+
+
+def turned(pixels):
+    """The camera of `record_moving`, turned so that its image moves by some pixels."""
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, np.arctan(pixels / K[0, 0]), 0.0]))[0]
+    return Camera(K, orbit_pose(0.8, 0.3, 0.9, TABLE) @ turn, 480, 640)
+
+
 def record_moving(folder, turns_px):
     """Record one-frame episodes of a robot with a camera that turns by some pixels before each of them."""
-    before = Camera(K, orbit_pose(0.8, 0.3, 0.9, TABLE), 480, 640)
+    before = turned(0)
     depth = in_mm(plane_depth(before))
     for episode, pixels in enumerate(turns_px):
-        turn = np.eye(4)
-        turn[:3, :3] = cv2.Rodrigues(np.array([0.0, np.arctan(pixels / K[0, 0]), 0.0]))[0]
-        camera = Camera(K, before.world_from_cam @ turn, 480, 640)
-        record_real_robot(folder / str(episode), textured_table(camera, seed=episode), depth, depth_unit="mm")
+        rgb = textured_table(turned(pixels), seed=episode)
+        record_real_robot(folder / str(episode), rgb, depth, depth_unit="mm")
     datasets = [LeRobotDataset("test/part", root=folder / str(episode)) for episode in range(len(turns_px))]
     merge_datasets(datasets, output_repo_id="test/moving", output_dir=folder / "merged")
     file = folder / "cameras.yaml"
@@ -208,6 +240,70 @@ def test_a_camera_of_another_pose_in_every_episode_is_not_compared(tmp_path, cap
     assert "every episode has a calibration of its own" in caplog.text
 
 
+@CameraConfig.register_subclass("fake_table_camera")
+@dataclass(kw_only=True)
+class FakeTableCameraConfig(CameraConfig):
+    turn_px: float = 0.0
+
+
+class FakeTableCamera(Device):
+    """Shows the table of `record_moving`."""
+
+    def __init__(self, config):
+        self.turn_px, self.is_open = config.turn_px, False
+
+    is_connected = property(lambda self: self.is_open)
+
+    def connect(self, warmup=True):
+        self.is_open = True
+
+    def read(self):
+        assert self.is_open
+        return textured_table(turned(self.turn_px), seed=9)
+
+    def disconnect(self):
+        self.is_open = False
+
+    async_read = read
+
+    @staticmethod
+    def find_cameras():
+        return []
+
+
+def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch, caplog, capsys):
+    folder, file, before = record_moving(tmp_path, [0])
+    monkeypatch.setattr(this_package, "FakeTableCamera", FakeTableCamera, raising=False)
+    flags = ["--dataset.repo_id=test/moving", f"--dataset.root={folder}", f"--calibration={file}", "--camera=front"]
+    flags += [f"--output_dir={tmp_path / 'out'}", "--rerun=false", "--device.type=fake_table_camera"]
+
+    def check(*more):
+        caplog.clear()
+        monkeypatch.setattr(sys, "argv", ["symview-preview", *flags, *more])
+        with caplog.at_level(logging.INFO, logger="symview_eval"), pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr().err.splitlines()[-1:], caplog.text
+
+    code, _, log = check("--check=true")
+    assert code == 0
+    assert re.search(r"camera 'front' stands still: the live image is shifted by 0\.\d pixels", log)
+    assert not (tmp_path / "out" / "cameras.yaml").exists()
+    code, _, log = check("--check=true", "--device.turn_px=5")
+    assert code == 0
+    assert re.search(r"was moved since episode 0: the live image is shifted by (4\.[7-9]|5\.[0-3]) pixels", log)
+    now = read_calibration(tmp_path / "out" / "cameras.yaml").camera("front")
+    assert pose_errors(before, now.world_from_cam)[0] == pytest.approx(np.rad2deg(np.arctan(5 / K[0, 0])), abs=0.05)
+    code, error, _ = check()
+    assert code == 2
+    assert error == [
+        "symview-preview: error: --device takes an image to compare with the dataset: give --check=true beside it"
+    ]
+    monkeypatch.setattr(FakeTableCamera, "read", lambda self: np.zeros((480, 640, 3), np.uint8))
+    code, (error,), _ = check("--check=true")
+    assert code == 2
+    assert error.startswith("symview-preview: error: --device: the live image cannot be compared with episode 0: ")
+
+
 def test_a_dataset_of_views_alone_cannot_be_checked(only_views, tmp_path):
     with pytest.raises(ValueError, match="--check and --check_image need the camera's images"):
         preview(config(only_views, tmp_path, check=True))
@@ -215,11 +311,9 @@ def test_a_dataset_of_views_alone_cannot_be_checked(only_views, tmp_path):
 
 def test_an_image_of_today_tells_whether_the_camera_was_moved(tmp_path, caplog):
     folder, file, before = record_moving(tmp_path, [0, 0])
-    turn = np.eye(4)
-    turn[:3, :3] = cv2.Rodrigues(np.array([0.0, np.arctan(4 / K[0, 0]), 0.0]))[0]
     images = {
         "same.png": textured_table(before, seed=7),
-        "moved.png": textured_table(Camera(K, before.world_from_cam @ turn, 480, 640), seed=8),
+        "moved.png": textured_table(turned(4), seed=8),
         "black.png": np.zeros((480, 640, 3), np.uint8),
     }
     written = tmp_path / "out" / "cameras.yaml"
@@ -233,8 +327,8 @@ def test_an_image_of_today_tells_whether_the_camera_was_moved(tmp_path, caplog):
             preview(config(folder, tmp_path / "out", check_image=tmp_path / name, **options))
         return caplog.text
 
-    still = re.compile(r"camera 'front' stands still: in same\.png its image has moved by 0\.\d pixels")
-    moved = re.compile(r"was moved since episode 0: in moved\.png its image by (3\.[7-9]|4\.[0-4]) pixels")
+    still = re.compile(r"camera 'front' stands still: same\.png is shifted by 0\.\d pixels")
+    moved = re.compile(r"was moved since episode 0: moved\.png is shifted by (3\.[7-9]|4\.[0-4]) pixels")
     assert still.search(check("same.png"))
     assert not written.exists()
     assert moved.search(check("moved.png"))

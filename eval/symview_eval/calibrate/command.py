@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from pathlib import Path
 
 from numpy.typing import NDArray
@@ -22,11 +21,12 @@ from lerobot_symview.geometry.units import in_metres, parse_unit, unit_name
 from lerobot_symview.geometry.visibility import camera_problem, check_camera
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.runtime.cli import flagged, run_command
-from symview_eval.calibrate.config import CalibrateConfig, with_device
+from symview_eval.calibrate.config import CalibrateConfig
 from symview_eval.calibrate.from_board import from_board, photographs
 from symview_eval.calibrate.from_gripper import from_gripper
 from symview_eval.calibrate.output import Result, existing_calibration, replace_file, write_result
 from symview_eval.calibrate.photographs import depth_from_dataset, depth_from_file
+from symview_eval.live_camera import with_device
 
 logger = logging.getLogger(__name__)
 
@@ -149,10 +149,4 @@ def _fits(depth: NDArray, camera: Camera) -> bool:
 
 def main() -> None:
     """Run the console command."""
-    live = any(argument.startswith("--device") for argument in sys.argv)
-    run_command(
-        with_device() if live else CalibrateConfig,
-        calibrate,
-        EXAMPLES,
-        short={"--root": "--dataset.root", **POSE_FLAGS},
-    )
+    run_command(with_device(CalibrateConfig), calibrate, EXAMPLES, short={"--root": "--dataset.root", **POSE_FLAGS})

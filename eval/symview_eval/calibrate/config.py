@@ -71,7 +71,8 @@ class CalibrateConfig:
     pose_image: str = ""
     """Image that shows the board at its place on the table; by default the first. In all others it may be anywhere."""
     intrinsics: str = ""
-    """`fx,fy,cx,cy` in pixels, or a calibration file with the camera. By default they are estimated from all images."""
+    """`fx,fy,cx,cy` in pixels, or a calibration file of any tool, with or without a pose. By default they are estimated
+    from all images."""
     workspace: Workspace | None = None
     """Square on the table that views show; by default that of an existing output, else 0.4 m about the board."""
     refine: str = ""
@@ -115,22 +116,3 @@ class CalibrateConfig:
                 parse_unit(self.depth_unit)
             except ValueError as error:
                 raise ValueError(f"--depth_unit: {error}") from None
-
-
-def with_device() -> type[CalibrateConfig]:
-    """Return the configuration with a LeRobot camera; LeRobot, which takes seconds to import, registers its types."""
-    from lerobot.cameras import CameraConfig
-    from lerobot.cameras.opencv import configuration_opencv  # noqa: F401
-    from lerobot.cameras.realsense import configuration_realsense  # noqa: F401
-    from lerobot.cameras.zmq import configuration_zmq  # noqa: F401
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    register_third_party_plugins()
-
-    @dataclass(frozen=True)
-    class CalibrateWithDeviceConfig(CalibrateConfig):
-        device: CameraConfig | None = None
-
-    CalibrateWithDeviceConfig.__annotations__["device"] = CameraConfig | None
-    CalibrateWithDeviceConfig.__doc__ = CalibrateConfig.__doc__
-    return CalibrateWithDeviceConfig

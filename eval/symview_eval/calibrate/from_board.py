@@ -21,18 +21,17 @@ from lerobot_symview.calibration.board_pose import (
     estimate_intrinsics,
     world_from_cam,
 )
-from lerobot_symview.calibration.read import read_calibration
+from lerobot_symview.calibration.read import ANY_POSE, read_intrinsics
 from lerobot_symview.errors import CalibrationError
-from lerobot_symview.geometry.camera import Camera, from_ideal, orbit_pose
+from lerobot_symview.geometry.camera import Camera, from_ideal
 from lerobot_symview.geometry.lens import EQUIDISTANT, lens_from_coefficients
-from lerobot_symview.runtime.cli import CommandError, flagged
+from lerobot_symview.runtime.cli import flagged
 from symview_eval.calibrate.config import CalibrateConfig
 from symview_eval.calibrate.output import Result
-from symview_eval.calibrate.photographs import Photographs, from_dataset, from_device, from_files
+from symview_eval.calibrate.photographs import Photographs, from_dataset, from_files
+from symview_eval.live_camera import device_of, take_images
 
 logger = logging.getLogger(__name__)
-
-ANY_POSE = orbit_pose(1.0, 0.0, 1.0, (0.0, 0.0, 0.0))
 
 
 def photographs(config: CalibrateConfig) -> Photographs:
@@ -43,13 +42,9 @@ def photographs(config: CalibrateConfig) -> Photographs:
     if config.dataset is not None:
         with flagged("--dataset, --camera, --episodes"):
             return from_dataset(config.dataset.folder(), config.camera, config.episodes, config.frames)
-    device = getattr(config, "device", None)
-    if device is None:
-        return {}
-    try:
-        return from_device(device, config.frames)
-    except (ImportError, RuntimeError) as error:  # LeRobot's cameras raise these, and OSError
-        raise CommandError(f"--device: {error}") from None
+    device = device_of(config)
+    images = [] if device is None else take_images(device, config.frames)
+    return {f"image {index}": image for index, image in enumerate(images)}
 
 
 def from_board(config: CalibrateConfig) -> Result:
@@ -130,7 +125,7 @@ def given_camera(config: CalibrateConfig, size: tuple[int, ...] | None) -> Camer
         if "," in config.intrinsics:
             raise ValueError("--intrinsics=fx,fy,cx,cy needs --image_size='[rows, columns]' beside it")
         with flagged("--intrinsics"):
-            _, camera = _known_camera(config)
+            camera = read_intrinsics(config.intrinsics, config.camera)
             size = camera.height, camera.width
     height, width = size
     intrinsics = _given_intrinsics(config, height, width)
@@ -139,23 +134,16 @@ def given_camera(config: CalibrateConfig, size: tuple[int, ...] | None) -> Camer
         return Camera(intrinsics.matrix, ANY_POSE, height, width, lens, intrinsics.depth_sensor)
 
 
-def _known_camera(config: CalibrateConfig) -> tuple[str, Camera]:
-    """Return name and camera of the file in `--intrinsics`: the only one, or that of the wanted name."""
-    known = read_calibration(config.intrinsics)
-    name = next(iter(known.cameras)) if len(known.cameras) == 1 else config.camera
-    return name, known.camera(name)
-
-
 def _given_intrinsics(config: CalibrateConfig, height: int, width: int) -> Intrinsics:
     """Return the intrinsics of the flag, four numbers or a calibration file."""
     try:
         fx, fy, cx, cy = (float(number) for number in config.intrinsics.strip("[]").split(","))
     except ValueError:
         with flagged("--intrinsics"):
-            name, camera = _known_camera(config)
+            camera = read_intrinsics(config.intrinsics, config.camera, (height, width))
         if (camera.height, camera.width) != (height, width):
             raise CalibrationError(
-                f"--intrinsics: camera {name!r} has images of {camera.width} x {camera.height} pixels, "
+                f"--intrinsics: {config.intrinsics} is of images of {camera.width} x {camera.height} pixels, "
                 f"these have {width} x {height}"
             ) from None
         if camera.lens is None:

@@ -1,10 +1,8 @@
-"""Images to calibrate a camera from: files, frames of a LeRobot dataset, or a LeRobot camera."""
+"""Images to calibrate a camera from: files, or frames of a LeRobot dataset."""
 
 from __future__ import annotations
 
 import glob
-import logging
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +15,9 @@ from lerobot_symview.datasets.image_codec import decode_depth, decode_rgb
 from lerobot_symview.datasets.source import EpisodeTables, SourceDataset
 from lerobot_symview.errors import CalibrationError, DatasetError
 
-logger = logging.getLogger(__name__)
-
 Photographs = dict[str, NDArray[np.uint8]]
 """Name of an image -> (H, W, 3) uint8 RGB, in order."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-PAUSE = 2.0  # seconds between images of a device, in which the board is moved
 
 
 def from_files(pattern: str) -> Photographs:
@@ -92,24 +87,6 @@ def depth_from_file(file: Path) -> NDArray:
     if depth.ndim != 2:
         raise CalibrationError(f"{file}: expected depth of shape (height, width), got {depth.shape}")
     return depth
-
-
-def from_device(config: Any, frames: int) -> Photographs:
-    """Take images with a LeRobot camera, given its configuration; between them there is time to move the board."""
-    from lerobot.cameras.utils import make_cameras_from_configs
-
-    device = make_cameras_from_configs({"camera": config})["camera"]
-    photographs = {}
-    device.connect()
-    try:
-        for index in range(frames):
-            if index:
-                logger.info("image %d of %d in %.0f s: move the board", index + 1, frames, PAUSE)
-                time.sleep(PAUSE)
-            photographs[f"image {index}"] = np.asarray(device.read(), dtype=np.uint8)
-    finally:
-        device.disconnect()
-    return photographs
 
 
 def chosen_frames(episode: int, length: int, frames: int) -> dict[str, int]:

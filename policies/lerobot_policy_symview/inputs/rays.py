@@ -29,7 +29,8 @@ def pixel_rays(
         v, u = (torch.arange(count, dtype=torch.float64, device=k.device) for count in size)
         v = v[:, None]
     else:
-        u, v = ideal_pixels_batch([camera.resized(*size) for camera in cameras], k.device)
+        height, width = map(int, size)  # a trace records sizes as tensors
+        u, v = ideal_pixels_batch([camera.resized(height, width) for camera in cameras], k.device)
     v, u = ((axis + 0.5) * full / count - 0.5 for axis, full, count in zip((v, u), calibrated, size, strict=True))
     x = (u - k[:, 0, 2, None, None]) / k[:, 0, 0, None, None]
     y = (v - k[:, 1, 2, None, None]) / k[:, 1, 1, None, None]

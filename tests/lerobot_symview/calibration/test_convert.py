@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_symview.calibration.convert import convert
 from lerobot_symview.calibration.file import parse_calibration, plain_calibration
-from lerobot_symview.calibration.read import read_calibration
+from lerobot_symview.calibration.read import read_calibration, read_intrinsics
 from lerobot_symview.calibration.readings import PoseReading, ReadingError, readings
 from lerobot_symview.calibration.writers import camera_info, easy_handeye2
 from lerobot_symview.errors import CalibrationError, OptionError
@@ -62,6 +62,22 @@ def test_the_reading_that_sees_the_workspace_is_found_and_logged(write, intrinsi
     assert all("is read as millimetres" in each for each in unit)
     assert f"read as {'base_to_camera' if inverse else 'camera_to_base'}, " in line
     assert "the only one of 6 readings that sees the workspace" in line
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        files.realsense(coeffs=[0] * 5),
+        files.camera_matrix(),
+        ours(height=files.HEIGHT, width=files.WIDTH, intrinsics=files.K.tolist()),
+        ours(height=files.HEIGHT, width=files.WIDTH, intrinsics=files.K.tolist(), position=[0, 0, "no number"]),
+        files.camera_to_world(),
+    ],
+)
+def test_intrinsics_are_read_without_the_pose(write, content):
+    camera = read_intrinsics(write("k", content), "front", SIZE)
+    np.testing.assert_allclose(camera.intrinsics, files.K, atol=1e-3)
+    assert (camera.height, camera.width) == SIZE
 
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])

@@ -157,7 +157,30 @@ def test_intrinsics_are_read_from_a_file(run, photo, tmp_path):
     (tmp_path / "k.yaml").write_text(yaml.safe_dump(plain_calibration(Calibration({"anything": small}))))
     code, error, _ = run(f"--images={photo}", "--intrinsics=k.yaml")
     assert code == 2
-    assert "has images of 320 x 240 pixels, these have 640 x 480" in error
+    assert "k.yaml is of images of 320 x 240 pixels, these have 640 x 480" in error
+
+
+def camera_info():
+    """K as ROS's camera_calibration writes it."""
+    content = yaml.safe_load(files.camera_info()) | {"image_width": 640, "image_height": 480}
+    content["camera_matrix"] = files.matrix(K)
+    content["distortion_coefficients"] = files.matrix(np.zeros((1, 5)))
+    return yaml.safe_dump(content)
+
+
+@pytest.mark.parametrize("content", [camera_info(), files.savetxt(K)], ids=["camera_info", "without an image size"])
+def test_intrinsics_are_read_from_a_file_without_a_pose(run, photo, tmp_path, content):
+    (tmp_path / "k").write_text(content)
+    code, error, _ = run(f"--images={photo}", "--intrinsics=k")
+    assert (code, error) == (0, "")
+    assert pose_errors(CAMERA, read_calibration("cameras.yaml").camera("front").world_from_cam)[1] < 1
+
+
+def test_intrinsics_from_a_file_of_a_pose_alone_are_refused(run, photo, tmp_path):
+    (tmp_path / "pose.txt").write_text(files.savetxt(files.BASE_FROM_CAMERA))
+    code, error, _ = run(f"--images={photo}", "--intrinsics=pose.txt")
+    assert code == 2
+    assert "--intrinsics: pose.txt has the pose of camera 'front', but no intrinsics" in error
 
 
 @pytest.mark.parametrize(
