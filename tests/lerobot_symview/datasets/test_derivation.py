@@ -122,6 +122,9 @@ def test_a_killed_process_keeps_finished_parts(recorded, reference, tmp_path):
             with suppress(ProcessLookupError):
                 os.kill(child, signal.SIGKILL)
             status = int(forking.stdout.readline())
+            if status == 0 and kills == 0:  # on a busy machine the first runs may end before they are killed
+                shutil.rmtree(target)
+                continue
             if status == 0:
                 break
             assert status == signal.SIGKILL
