@@ -106,7 +106,7 @@ def _rank(cell: Cell) -> int:
         return 1
     if cell.experiment.startswith("figure") and cell.task in FIRST_TASKS:
         return 2
-    if cell.experiment in ("transfer", "robustness", "hidden") and cell.task in TRANSFER_TASKS:
+    if cell.experiment in ("transfer", "robustness", "lens", "hidden") and cell.task in TRANSFER_TASKS:
         return 2
     if cell.experiment in ("chunks", "chunks_moved") and cell.task in FIRST_CHUNK_TASKS:
         return 2

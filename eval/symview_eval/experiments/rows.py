@@ -108,7 +108,6 @@ PLACEMENTS = (
 AUGMENTED = method_row(
     "reproj_equi_augmented", "Reproj. Equi, camera augmentation", "reproj_equi", camera_augmentation=1.0
 )
-WEBCAM = (-0.3, 0.1, 0.0, 0.0)  # k1, k2, p1, p2: barrel distortion as of a wide-angle webcam, 16 pixels in a corner
 WITH_ERRORS = (REPROJ, AUGMENTED, PERSP, SIDE, PLAIN, VOXEL, CLOUD)
 SENSORS = (
     ("exact", CameraSpec()),
@@ -119,9 +118,15 @@ SENSORS = (
     *((f"depth noise {1000 * metres:g} mm", CameraSpec(depth_noise=metres)) for metres in (0.001, 0.0025, 0.005)),
     *((f"depth dropout {100 * share:g} %", CameraSpec(depth_dropout=share)) for share in (0.01, 0.1)),
     ("flying pixels 50 %", CameraSpec(flying_pixels=0.5)),
-    ("lens", CameraSpec(distortion=WEBCAM)),
-    ("lens that the calibration ignores", CameraSpec(distortion=WEBCAM, distortion_known=False)),
     ("late by an action", CameraSpec(delay=1)),
+)
+
+
+WEBCAM = (-0.3, 0.1, 0.0, 0.0)  # k1, k2, p1, p2: barrel distortion as of a wide-angle webcam, 16 pixels in a corner
+LENSES = (
+    ("without a lens", CameraSpec()),
+    ("known", CameraSpec(distortion=WEBCAM)),
+    ("left out of the calibration", CameraSpec(distortion=WEBCAM, distortion_known=False)),
 )
 
 

@@ -16,6 +16,7 @@ from symview_eval.experiments.rows import (
     ELEVATIONS,
     FOREIGN,
     FOREIGN_MOVED,
+    LENSES,
     ORACLE,
     ORACLE_RGB,
     PERSP,
@@ -154,6 +155,14 @@ EXPERIMENTS = {
             CLONED_TASKS,
             (10,),
             placements=SENSORS,
+        ),
+        Experiment(
+            "lens",
+            "A lens that the training did not have",
+            WITH_ERRORS,
+            CLONED_TASKS,
+            (10,),
+            placements=LENSES,
         ),
         Experiment(
             "hidden",
