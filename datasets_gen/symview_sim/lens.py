@@ -1,9 +1,9 @@
 """What a camera with a lens sees: the image of a wider pinhole camera, resampled.
 
 Each pixel takes colour, depth and label of the nearest pixel of an image with three times as many in a row, at most a
-sixth of a pixel away. Nothing is averaged: a mean of two depths lies on neither surface, and a mean of colours differs
-from what the simulators draw without a lens. Depth is along the optical axis, which is that of the wider camera, so it
-stays as it is.
+sixth of a pixel away along each axis where the lens keeps the scale. Nothing is averaged: a mean of two depths lies on
+neither surface, and a mean of colours differs from what the simulators draw without a lens. Depth is along the optical
+axis, which is that of the wider camera, so it stays as it is.
 """
 
 from __future__ import annotations

@@ -120,9 +120,13 @@ class Simulators:
         return [process.pid or 0 for process, _ in self._workers]
 
     def cpu_seconds(self) -> float:
-        """Return the CPU time that all simulators have used, seconds."""
-        used = [psutil.Process(process_id).cpu_times() for process_id in self.process_ids]
-        return float(sum(times.user + times.system for times in used))
+        """Return the CPU time that all running simulators have used, seconds."""
+        seconds = 0.0
+        for process_id in self.process_ids:
+            with suppress(psutil.NoSuchProcess):  # `receive` replaces one that has died
+                times = psutil.Process(process_id).cpu_times()
+                seconds += times.user + times.system
+        return seconds
 
     def is_alive(self, index: int) -> bool:
         """Whether a simulator's process is running."""

@@ -188,7 +188,7 @@ def preview(config: PreviewConfig) -> Path:
         raise CommandError(f"--episodes names {unknown}, the dataset has {total} episodes, from 0 to {total - 1}")
     reader, views = _chosen(config, source)
     if (config.check or config.check_image) and reader is None:
-        raise ValueError("--check and --check_image need the camera's images: the dataset has views only")
+        raise ValueError("--check, --check_image and --device need the camera's images: the dataset has views only")
     from symview_eval.declaration import check_declaration  # imports LeRobot, which takes seconds
 
     declaration = check_declaration(source, reader, config.state_symmetry, config.action_symmetry)
@@ -244,6 +244,12 @@ def _check_camera(config: PreviewConfig, reader: FrameReader) -> None:
             check_image(reader, name, image, config.output_dir)
     elif device is not None:
         (image,) = take_images(device)
+        height, width, _ = reader.dataset.features[keys.rgb(config.camera)]["shape"]
+        if image.shape[:2] != (height, width):
+            raise CommandError(
+                f"--device took an image of {image.shape[1]} x {image.shape[0]} pixels, those of camera "
+                f"{config.camera!r} have {width} x {height}: give --device.width={width} --device.height={height}"
+            )
         with flagged("--device"):
             check_image(reader, "the live image", image, config.output_dir)
     elif config.check:

@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_symview.calibration.file import METRES, POSES, parse_calibration, parse_workspace, plain_depth_sensor
+from lerobot_symview.calibration.file import (
+    METRES,
+    POSES,
+    parse_calibration,
+    parse_workspace,
+    plain_depth_sensor,
+    without_table_height,
+)
 from lerobot_symview.calibration.formats import FORMATS, CameraFacts, Facts, Format, parse, recognise
 from lerobot_symview.calibration.formats.document import Document, read_document
 from lerobot_symview.calibration.formats.facts import Pose, Size
@@ -77,7 +84,7 @@ def convert(
         named += [name] if name else []
     camera = camera or (named[0] if named else "camera")
     if workspaces:
-        workspace = parse_workspace(workspaces[0])
+        workspace = parse_workspace(without_table_height(workspaces[0])[0])
     entries = _join(sources, camera, size, pose_needed)
     if "depth_sensor" in entries:
         entries["depth_sensor"] = _scaled(entries["depth_sensor"], 1 / METRES.get(str(units), 1.0))
@@ -208,7 +215,10 @@ def _join(sources: Sequence[_Source], camera: str, size: Size | None, pose_neede
             f"no pose of the camera in the robot's base or the world: add a file with it, such as {HAS_POSE}"
         )
     if "height" not in joined or "width" not in joined:
-        missing.append("no height and width of the image: add a file with them, such as ROS camera_info")
+        missing.append(
+            "no height and width of the image: add a file with them, such as ROS camera_info, or give "
+            "--image_size='[rows, columns]' to symview-calibrate"
+        )
     if missing:
         verb = "has" if len(sources) == 1 else "have"
         raise CalibrationError(f"{files} {verb} the {gives} of camera {camera!r}, but {'; and '.join(missing)}")

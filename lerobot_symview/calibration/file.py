@@ -117,7 +117,7 @@ def parse_calibration(content: Any) -> Calibration:
     table_height = 0.0
     if content.get("workspace") is not None:
         try:
-            entries, table_height = _without_table_height(content["workspace"])
+            entries, table_height = without_table_height(content["workspace"])
             workspace = None if entries == {} else parse_workspace(entries)
         except CalibrationError as error:
             problems.append(f"workspace: {error}")
@@ -141,7 +141,7 @@ def parse_calibration(content: Any) -> Calibration:
     return _on_table(found, world_from_base, table_height)
 
 
-def _without_table_height(entries: Any) -> tuple[Any, float]:
+def without_table_height(entries: Any) -> tuple[Any, float]:
     """Return the entries of `Workspace`, and the table's height in the world, metres."""
     if not isinstance(entries, Mapping) or "table_height" not in entries:
         return entries, 0.0

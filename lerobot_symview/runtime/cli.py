@@ -115,7 +115,7 @@ def _parsed[Config](config_class: type[Config]) -> Config:
 
     parser: ArgumentParser[Config] = ArgumentParser(config_class)
     for action in parser.parser._actions:
-        if action.type is bool:
+        if action.type in (bool, bool | None):
             action.nargs, action.const = "?", "true"
     return parser.parse_args()
 

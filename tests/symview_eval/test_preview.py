@@ -298,6 +298,10 @@ def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch,
     assert error == [
         "symview-preview: error: --device takes an image to compare with the dataset: give --check=true beside it"
     ]
+    monkeypatch.setattr(FakeTableCamera, "read", lambda self: np.zeros((720, 1280, 3), np.uint8))
+    code, (error,), _ = check("--check=true")
+    assert code == 1
+    assert error.endswith("of camera 'front' have 640 x 480: give --device.width=640 --device.height=480")
     monkeypatch.setattr(FakeTableCamera, "read", lambda self: np.zeros((480, 640, 3), np.uint8))
     code, (error,), _ = check("--check=true")
     assert code == 2
@@ -305,7 +309,7 @@ def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch,
 
 
 def test_a_dataset_of_views_alone_cannot_be_checked(only_views, tmp_path):
-    with pytest.raises(ValueError, match="--check and --check_image need the camera's images"):
+    with pytest.raises(ValueError, match="--check, --check_image and --device need the camera's images"):
         preview(config(only_views, tmp_path, check=True))
 
 

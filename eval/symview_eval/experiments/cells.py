@@ -79,8 +79,8 @@ class CellJob:
 
     @property
     def training_state(self) -> Path:
-        """Folder of the checkpoints of an unfinished cloning."""
-        return self.output / "training_state"
+        """Folder of the checkpoints of an unfinished cloning, of this cell alone: others may share its policy."""
+        return self.output / f"training_state_{self.cell.configuration_hash}"
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def _run(job: CellJob) -> None:
         checkpoints, times = _run_rl(job, env)
     elif cell.placements:
         if not job.policy.is_dir():
-            _clone(job, env)
+            earlier_s = _clone(job, env).earlier_s
         checkpoints, times = evaluate_placements(cell, load_actor(cell, job.policy), env)
     else:
         training = _clone(job, env)

@@ -35,8 +35,8 @@ EXAMPLES = """\
   symview-experiment report
 
 The first argument is the experiment (table1 to table5, figure5 to figure7, transfer, robustness, lens, hidden,
-metaworld, metaworld_moved, chunks, chunks_planner, chunks_moved), all of them (all), or report, which rebuilds the tables and
-plots of all results."""
+metaworld, metaworld_moved, chunks, chunks_planner, chunks_moved), all of them (all), or report, which rebuilds the
+tables and plots of all results."""
 
 BATCH = 8  # cells per worker whose demonstrations are recorded together, before they run
 

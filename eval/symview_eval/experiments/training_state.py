@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import time
 from collections.abc import Callable
@@ -19,6 +20,8 @@ from lerobot.utils.random_utils import load_rng_state, save_rng_state
 from safetensors.torch import load_model, save_model
 
 from lerobot_symview.runtime.staging import part_of, plain
+
+logger = logging.getLogger(__name__)
 
 INTERVAL_S = 300.0  # so that cells of two minutes write none
 PROGRESS, POLICY = "progress.json", "policy.safetensors"
@@ -87,12 +90,19 @@ class Checkpoints:
         self._written = time.monotonic()
 
     def last(self) -> tuple[Path, dict[str, Any]] | None:
-        """Return the folder of the last checkpoint and what `save` returned; None if there is none to continue from."""
+        """Return the folder of the last checkpoint and what `save` returned; None if there is none to continue from.
+
+        Checkpoints of other software or another device are removed.
+        """
         complete = sorted(path for path in self._folder.glob("*") if path.name.isdigit())
         if not complete:
             return None
         content: dict[str, Any] = json.loads((complete[-1] / PROGRESS).read_text())
-        return (complete[-1], content) if content["made_by"] == self._made_by else None
+        if content["made_by"] == self._made_by:
+            return complete[-1], content
+        logger.info("training starts from the beginning: its checkpoint is of %s", content["made_by"])
+        remove(self._folder)
+        return None
 
 
 def remove(folder: Path) -> None:

@@ -70,6 +70,8 @@ def test_the_reading_that_sees_the_workspace_is_found_and_logged(write, intrinsi
         files.realsense(coeffs=[0] * 5),
         files.camera_matrix(),
         ours(height=files.HEIGHT, width=files.WIDTH, intrinsics=files.K.tolist()),
+        ours(height=files.HEIGHT, width=files.WIDTH, intrinsics=files.K.tolist())
+        + "workspace: {size: 0.4, table_height: 0.8}",
         ours(height=files.HEIGHT, width=files.WIDTH, intrinsics=files.K.tolist(), position=[0, 0, "no number"]),
         files.camera_to_world(),
     ],

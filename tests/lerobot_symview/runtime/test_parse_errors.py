@@ -57,6 +57,7 @@ class Config:
     size: int = 3
     rate: float = 0.5
     resume: bool = False
+    private: bool | None = None
     clip: Literal["gripper", "none"] | float = "gripper"
     origin: Literal["world", "base"] | None = None
     names: list[str] = field(default_factory=list)
@@ -109,6 +110,7 @@ def test_the_terminal_shows_one_line_with_flag_value_and_expectation(flags, show
         (["--resume", "false"], False, True),
         (["--resume=false", "--env.oracle"], False, True),
         (["--env.oracle=false"], False, False),
+        (["--private"], False, True),
     ],
     ids=str,
 )
@@ -119,6 +121,7 @@ def test_a_boolean_flag_without_a_value_is_true(flags, resume, oracle, monkeypat
         run_command(Config, parsed.append, "")
     assert end.value.code == 0
     assert (parsed[0].resume, parsed[0].env.oracle, parsed[0].size) == (resume, oracle, 3)
+    assert parsed[0].private is (True if "--private" in flags else None)
 
 
 def test_a_missing_flag_is_named(monkeypatch, capsys):

@@ -90,7 +90,15 @@ def test_costs_of_chunks_are_of_the_same_row(tmp_path):
 
 def test_what_remains_counts_each_run_once():
     cells = all_cells(tasks=["block_stacking"], methods=["reproj_equi"], demos=[10], seeds=[0])
-    assert [cell.experiment for cell in cells] == ["table1", "table3", "table4", "transfer", "robustness", "lens", "hidden"]
+    assert [cell.experiment for cell in cells] == [
+        "table1",
+        "table3",
+        "table4",
+        "transfer",
+        "robustness",
+        "lens",
+        "hidden",
+    ]
     assert len(distinct(cells)) == 4
     assert len({cell.training_hash for cell in cells}) == 1  # the others use the policy of the tables
     cells = cells[:3]

@@ -162,6 +162,7 @@ def test_the_last_of_two_checkpoints_counts(tmp_path):
 def test_checkpoints_of_other_software_are_not_read(tmp_path):
     assert write(tmp_path, 1, "another version").last() is not None
     assert Checkpoints(tmp_path, {"torch": "this version"}).last() is None
+    assert write(tmp_path, 1).last() is not None  # of the same step
     assert Checkpoints(tmp_path / "none", {"torch": "this version"}).last() is None
 
 
