@@ -8,7 +8,8 @@ import torch
 
 from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth
 from lerobot_policy_symview.inputs.voxels import voxelize
-from lerobot_policy_symview.nn.encoders.point_cloud import farthest_points, neighborhoods
+from lerobot_policy_symview.nn.encoders.point_cloud import PointEncoder, farthest_points, neighborhoods
+from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.camera import Camera, unproject
 from lerobot_symview.geometry.lens import Lens
@@ -137,3 +138,14 @@ def test_farthest_points_and_neighborhoods_match_loops():
             within = [i for i in range(40) if squared[scene_index, center, i] <= 0.09]
             nearest = sorted(within, key=lambda i: float(squared[scene_index, center, i]))[:8]
             assert grouped[scene_index, center].tolist() == nearest + [center] * (8 - len(nearest))
+
+
+@pytest.mark.parametrize("width", [16, 64])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_features_of_an_untrained_network_are_of_order_one(scene, width, seed):
+    """Max pooling adds to them in every abstraction: without normalisation their root mean square is 2 to 4."""
+    torch.manual_seed(seed)
+    encoder = PointEncoder(make_group("D4"), np.ones((8, 1, 1)), width)
+    with torch.no_grad():
+        features = encoder(make_cloud(scene).sample(1024, shuffle=False), torch.tensor([[0.5]]))
+    assert 0.5 < features.square().mean().sqrt() < 1.8

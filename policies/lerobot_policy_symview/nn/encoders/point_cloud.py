@@ -52,7 +52,11 @@ class PointEncoder(Encoder):
 
 
 class FieldMlp(nn.Module):
-    """Equivariant multi-layer perceptron with ReLU, of a point's features and its offset (x, y, z) from a centre."""
+    """Equivariant multi-layer perceptron of a point's features and its offset (x, y, z) from a centre.
+
+    Every layer is followed by layer normalisation and ReLU. The statistics of a point's channels are invariant, and
+    averaged and target networks need no running ones, as they would for PointNet++'s batch normalisation.
+    """
 
     def __init__(self, group: PlanarGroup, inputs: int | NDArray[np.float64], fields: Sequence[int]):
         super().__init__()
@@ -66,10 +70,15 @@ class FieldMlp(nn.Module):
         gathered = self.from_features(features)
         if index is not None:  # after the linear map, which commutes with it: there are fewer points than neighbours
             gathered = _gather(gathered, index)
-        hidden = functional.relu(gathered + self.from_offset(offset))
+        hidden = normalized_relu(gathered + self.from_offset(offset))
         for layer in self.layers:
-            hidden = functional.relu(layer(hidden))
+            hidden = normalized_relu(layer(hidden))
         return hidden
+
+
+def normalized_relu(features: Tensor) -> Tensor:
+    """Return the ReLU of features (..., channels), normalised over the channels."""
+    return functional.relu(functional.layer_norm(features, features.shape[-1:]))
 
 
 class SetAbstraction(nn.Module):
