@@ -94,9 +94,8 @@ ALLOWED_IMPORTS = {
         "methods",
         "symmetry",
     },
-    "lerobot_policy_symview.tracing": set(),
-    "lerobot_policy_symview.inputs": {"configuration", "symmetry", "tracing"},
-    "lerobot_policy_symview.nn": {"configuration", "encoders", "inputs", "symmetry", "tracing"},
+    "lerobot_policy_symview.inputs": {"configuration", "symmetry"},
+    "lerobot_policy_symview.nn": {"configuration", "encoders", "inputs", "symmetry"},
 }
 """Package -> the packages it may import; subpackage -> the subpackages of its own package. There are no cycles."""
 FORBIDDEN = {f"lerobot_symview.{name}": {"lerobot", "draccus"} for name in ("geometry", "views", "kinematics")}

@@ -23,6 +23,7 @@ from lerobot_symview.geometry.visibility import check_above_table
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.geometry.zbuffer import EMPTY, grid_from_pixel
 from lerobot_symview.views import PerspectiveView, ReprojectedView, View, check_gripper
+from lerobot_symview.views.tracing import is_exporting
 
 SOURCE_BITS = 31  # bits of a sort key for the pixel index; with 32 for the height the key fits a signed int64
 FRACTION = 32  # OpenCV's fixed-point steps per pixel
@@ -228,7 +229,7 @@ def ideal_pixels_batch(cameras: list[Camera], device: torch.device) -> tuple[Ten
 
 
 def _ideal_pixels_on(device: torch.device, optics: Optics) -> tuple[Tensor, Tensor]:
-    if torch.compiler.is_exporting() or torch.jit.is_tracing():  # type: ignore[attr-defined,no-untyped-call]
+    if is_exporting():
         return _copy_ideal_pixels(device, optics)  # a recorded tensor is of no use outside of its recording
     return _cached_ideal_pixels(device, optics)
 

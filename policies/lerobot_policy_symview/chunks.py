@@ -18,8 +18,8 @@ from lerobot_policy_symview.nn.encoders.wrist import WristEncoder
 from lerobot_policy_symview.nn.layers import asymmetry
 from lerobot_policy_symview.policy import MakeHead, Network, Stats, SymviewPolicy, scale_of
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
+from lerobot_symview.views.tracing import is_exporting
 
 
 class ChunkPolicy(SymviewPolicy):

@@ -13,8 +13,8 @@ from torch.nn import functional
 from lerobot_policy_symview.configuration_symview_sacfd import SymviewSacfdConfig
 from lerobot_policy_symview.nn.heads import GaussianHead
 from lerobot_policy_symview.policy import Network, SymviewPolicy
-from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
+from lerobot_symview.views.tracing import is_exporting
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 EPSILON = 1e-6  # keeps the logarithm finite where tanh saturates and 1 - action ** 2 is 0

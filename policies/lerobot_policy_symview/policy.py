@@ -34,10 +34,10 @@ from lerobot_policy_symview.symmetry.augmentation import AUGMENTATIONS, random_t
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.representations import VectorRepresentation
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_workspace
 from lerobot_symview.errors import DivergenceError
+from lerobot_symview.views.tracing import is_exporting
 
 ENDS = ("min", "max")
 logger = logging.getLogger(__name__)

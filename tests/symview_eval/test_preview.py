@@ -1,17 +1,13 @@
 import logging
 import re
 import sys
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from lerobot.cameras import Camera as Device
-from lerobot.cameras import CameraConfig
 from lerobot.datasets import LeRobotDataset, merge_datasets
 
-import tests.symview_eval as this_package
 from lerobot_symview.calibration.file import Calibration, plain_calibration
 from lerobot_symview.calibration.read import read_calibration
 from lerobot_symview.datasets.add_views import add_views
@@ -33,6 +29,7 @@ from symview_sim.settings import NewDataset
 from tests.helpers.boards import K, pose_errors
 from tests.helpers.cameras import make_camera, plane_depth
 from tests.helpers.datasets import in_mm, record_real_robot, views_config
+from tests.helpers.fakecamera import FakeCamera
 from tests.helpers.tables import TABLE, textured_table
 
 
@@ -240,42 +237,11 @@ def test_a_camera_of_another_pose_in_every_episode_is_not_compared(tmp_path, cap
     assert "every episode has a calibration of its own" in caplog.text
 
 
-@CameraConfig.register_subclass("fake_table_camera")
-@dataclass(kw_only=True)
-class FakeTableCameraConfig(CameraConfig):
-    turn_px: float = 0.0
-
-
-class FakeTableCamera(Device):
-    """Shows the table of `record_moving`."""
-
-    def __init__(self, config):
-        self.turn_px, self.is_open = config.turn_px, False
-
-    is_connected = property(lambda self: self.is_open)
-
-    def connect(self, warmup=True):
-        self.is_open = True
-
-    def read(self):
-        assert self.is_open
-        return textured_table(turned(self.turn_px), seed=9)
-
-    def disconnect(self):
-        self.is_open = False
-
-    async_read = read
-
-    @staticmethod
-    def find_cameras():
-        return []
-
-
 def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch, caplog, capsys):
     folder, file, before = record_moving(tmp_path, [0])
-    monkeypatch.setattr(this_package, "FakeTableCamera", FakeTableCamera, raising=False)
+    monkeypatch.setattr(FakeCamera, "see", lambda pixels: textured_table(turned(pixels), seed=9), raising=False)
     flags = ["--dataset.repo_id=test/moving", f"--dataset.root={folder}", f"--calibration={file}", "--camera=front"]
-    flags += [f"--output_dir={tmp_path / 'out'}", "--rerun=false", "--device.type=fake_table_camera"]
+    flags += [f"--output_dir={tmp_path / 'out'}", "--rerun=false", "--device.type=fake"]
 
     def check(*more):
         caplog.clear()
@@ -288,7 +254,7 @@ def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch,
     assert code == 0
     assert re.search(r"camera 'front' stands still: the live image is shifted by 0\.\d pixels", log)
     assert not (tmp_path / "out" / "cameras.yaml").exists()
-    code, _, log = check("--check=true", "--device.turn_px=5")
+    code, _, log = check("--check=true", "--device.position=5")
     assert code == 0
     assert re.search(r"was moved since episode 0: the live image is shifted by (4\.[7-9]|5\.[0-3]) pixels", log)
     now = read_calibration(tmp_path / "out" / "cameras.yaml").camera("front")
@@ -298,11 +264,11 @@ def test_a_camera_of_lerobot_is_compared_with_the_dataset(tmp_path, monkeypatch,
     assert error == [
         "symview-preview: error: --device takes an image to compare with the dataset: give --check=true beside it"
     ]
-    monkeypatch.setattr(FakeTableCamera, "read", lambda self: np.zeros((720, 1280, 3), np.uint8))
+    monkeypatch.setattr(FakeCamera, "see", lambda _: np.zeros((720, 1280, 3), np.uint8))
     code, (error,), _ = check("--check=true")
     assert code == 1
     assert error.endswith("of camera 'front' have 640 x 480: give --device.width=640 --device.height=480")
-    monkeypatch.setattr(FakeTableCamera, "read", lambda self: np.zeros((480, 640, 3), np.uint8))
+    monkeypatch.setattr(FakeCamera, "see", lambda _: np.zeros((480, 640, 3), np.uint8))
     code, (error,), _ = check("--check=true")
     assert code == 2
     assert error.startswith("symview-preview: error: --device: the live image cannot be compared with episode 0: ")

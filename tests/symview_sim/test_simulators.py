@@ -88,6 +88,7 @@ def test_a_dead_simulator_is_replaced_and_its_episode_lost(simulators, caplog, w
     if when == "idle":
         while simulators.is_alive(0):
             pass
+        assert simulators.cpu_seconds() > 0  # of the other one
         simulators.send(0, Step(ACTIONS[0], next_seed=5))
     outcome = simulators.receive(0)
     if when == "idle" or outcome.lost:  # a busy one may have finished before the signal

@@ -20,7 +20,6 @@ from lerobot_policy_symview.inputs.state import camera_directions
 from lerobot_policy_symview.inputs.voxels import voxelize
 from lerobot_policy_symview.symmetry.augmentation import crop, scale_down, transform_images
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
-from lerobot_policy_symview.tracing import is_exporting
 from lerobot_symview import keys
 from lerobot_symview.calibration.file import parse_calibration
 from lerobot_symview.geometry.camera import Camera, stored_camera
@@ -28,6 +27,7 @@ from lerobot_symview.geometry.gripper import gripper_image
 from lerobot_symview.geometry.gripper_state import POSE, gripper_columns, poses_from_states
 from lerobot_symview.geometry.workspace import Workspace
 from lerobot_symview.views import ReprojectedView
+from lerobot_symview.views.tracing import is_exporting
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from lerobot_policy_symview.nn.fourier_kernels import ORDER, PIXELS, PLANE, STRI
 from lerobot_policy_symview.nn.layers import FieldConv2d, steerable_basis
 from lerobot_policy_symview.nn.threads import in_threads
 from lerobot_policy_symview.symmetry.groups import DECIMALS, PlanarGroup, make_group
-from lerobot_policy_symview.tracing import is_exporting
+from lerobot_symview.views.tracing import is_exporting
 
 FUNCTIONS = 6  # of the steerable basis
 DIM1_ROWS, DIM2_ROWS = {ORDER: 6, 1: 4}, {ORDER: 12, 1: 1}  # per irrep, of a regular field and of a scalar

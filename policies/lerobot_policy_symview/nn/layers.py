@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_policy_symview.symmetry.groups import DECIMALS, PlanarGroup
-from lerobot_policy_symview.tracing import is_exporting
+from lerobot_symview.views.tracing import is_exporting
 
 RING_WIDTH = 0.4  # pixels; as in escnn's 3 x 3 filters, so that both span the same functions
 FREQUENCIES = 2  # highest angular frequency of the ring; 3 x 3 pixels hold no more without aliasing

@@ -2,18 +2,15 @@
 
 import logging
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import yaml
-from lerobot.cameras import Camera as Device
-from lerobot.cameras import CameraConfig
 from PIL import Image
 
-import tests.symview_eval.calibrate as this_package
 from lerobot_symview import keys
 from lerobot_symview.calibration.board import Board
 from lerobot_symview.calibration.file import Calibration, plain_calibration
@@ -25,6 +22,7 @@ from lerobot_symview.geometry.workspace import Workspace
 from symview_eval.calibrate import command
 from tests.helpers.boards import K, camera_over, close_views, photograph, pose_errors
 from tests.helpers.cameras import plane_depth
+from tests.helpers.fakecamera import FakeCamera
 from tests.lerobot_symview.calibration.formats import files
 
 pytestmark = pytest.mark.long
@@ -235,52 +233,24 @@ def test_the_board_is_printed(run, tmp_path, suffix):
     assert (tmp_path / f"board.{suffix}").stat().st_size < 300_000
 
 
-@CameraConfig.register_subclass("fake_board_camera")
-@dataclass(kw_only=True)
-class FakeBoardCameraConfig(CameraConfig):
-    distance: float = 0.8
-
-
-class FakeBoardCamera(Device):
-    """Shows the board."""
-
-    def __init__(self, config):
-        self.distance, self.connected = config.distance, False
-
-    is_connected = property(lambda self: self.connected)
-
-    def connect(self, warmup=True):
-        self.connected = True
-
-    def read(self):
-        assert self.connected
-        return photograph(Board(), camera_over(Board(), 50, 30, self.distance))
-
-    def disconnect(self):
-        self.connected = False
-
-    async_read = read
-
-    @staticmethod
-    def find_cameras():
-        return []
+def board_from(distance):
+    return photograph(Board(), camera_over(Board(), 50, 30, distance))
 
 
 def test_a_camera_of_lerobot_takes_the_image(run, monkeypatch):
-    monkeypatch.setattr(this_package, "FakeBoardCamera", FakeBoardCamera, raising=False)
-    code, error, _ = run("--device.type=fake_board_camera", "--device.distance=0.6", INTRINSICS)
+    monkeypatch.setattr(FakeCamera, "see", board_from, raising=False)
+    code, error, _ = run("--device.type=fake", "--device.position=0.6", INTRINSICS)
     assert (code, error) == (0, "")
     expected = camera_over(Board(), 50, 30, 0.6)
     assert pose_errors(expected, read_calibration("cameras.yaml").camera("front").world_from_cam)[1] < 1
 
 
 def test_a_camera_that_fails_is_an_error_in_one_line(run, monkeypatch, tmp_path):
-    def fail(self):
+    def fail(_):
         raise RuntimeError("no frame arrived")
 
-    monkeypatch.setattr(FakeBoardCamera, "read", fail)
-    monkeypatch.setattr(this_package, "FakeBoardCamera", FakeBoardCamera, raising=False)
-    code, error, _ = run("--device.type=fake_board_camera", INTRINSICS)
+    monkeypatch.setattr(FakeCamera, "see", fail, raising=False)
+    code, error, _ = run("--device.type=fake", INTRINSICS)
     assert (code, error) == (1, "symview-calibrate: error: --device: no frame arrived\n")
     assert not list(tmp_path.iterdir())
 

@@ -159,6 +159,15 @@ def test_the_last_of_two_checkpoints_counts(tmp_path):
     assert folder.name == "000100"
 
 
+def test_cells_that_share_a_policy_have_checkpoints_of_their_own(tmp_path):
+    """They may be trained at the same time."""
+    chosen = {"tasks": ["block_picking"], "methods": ["reproj_equi"], "demos": [10], "seeds": [0]}
+    cells = [cell for name in ("table1", "transfer") for cell in select(EXPERIMENTS[name], SCALE, **chosen)]
+    jobs = [CellJob(cell, tmp_path / "results", tmp_path / cell.training_hash, "cpu") for cell in cells]
+    assert jobs[0].policy == jobs[1].policy
+    assert jobs[0].training_state != jobs[1].training_state
+
+
 def test_checkpoints_of_other_software_are_not_read(tmp_path):
     assert write(tmp_path, 1, "another version").last() is not None
     assert Checkpoints(tmp_path, {"torch": "this version"}).last() is None

@@ -14,7 +14,7 @@ from lerobot_policy_symview.nn.encoders.convolutional import ConvolutionalEncode
 from lerobot_policy_symview.nn.layers import FieldConv3d
 from lerobot_policy_symview.nn.sparse_conv import SparseGrid, conv_and_pool
 from lerobot_policy_symview.symmetry.groups import PlanarGroup
-from lerobot_policy_symview.tracing import is_exporting
+from lerobot_symview.views.tracing import is_exporting
 
 SPARSE_LAYERS = 2  # the first; after them a grid has a few hundred voxels
 
