@@ -58,9 +58,10 @@ def slow_registration(depth, camera):
 
 
 @pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("focal", [18.0, 40.0], ids=["boxes of 3 and 4 pixels", "boxes of 1 and 2 pixels"])
 @pytest.mark.parametrize("color_from_depth", [placed(0.015), placed(-0.02, 0.01, 0.005, 3.0), placed(turn_deg=180.0)])
-def test_registration_equals_the_slow_reference(color_from_depth, lens):
-    camera = camera_with_sensor(color_from_depth, lens=lens)
+def test_registration_equals_the_slow_reference(color_from_depth, focal, lens):
+    camera = camera_with_sensor(color_from_depth, focal, lens)
     depth = sensor_depth(camera)
     depth[10:20, 20:40] -= 0.15
     depth[30] = 0
@@ -69,8 +70,8 @@ def test_registration_equals_the_slow_reference(color_from_depth, lens):
     assert (expected > 0).mean() > 0.7
     # Through a lens two corners are moved, not four: some boxes end a pixel earlier, where their neighbour's depth is.
     same = np.isclose(registered, expected, rtol=1e-5 if lens is None else 0.03)
-    assert same.mean() > (0.999 if lens is None else 0.98)
-    assert (registered > 0)[expected > 0].mean() > 0.997
+    assert same.mean() > (0.999 if lens is None else 0.97)
+    assert (registered > 0)[expected > 0].mean() > (0.999 if lens is None else 0.98)
 
 
 def test_an_aligned_sensor_changes_nothing():
