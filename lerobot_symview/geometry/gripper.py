@@ -42,19 +42,23 @@ def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperS
         outside. A finger's border pixels are antialiased, so the image changes smoothly with the gripper's pose.
         Rotating or reflecting the state, by any angle, is equivalent to drawing the rotated or reflected fingers.
     """
+    return gripper_coverage(state, workspace, pixels, shape) * state[..., 2, None, None] / workspace.height_limit
+
+
+def gripper_coverage(state: Any, workspace: Workspace, pixels: int, shape: GripperShape | None = None) -> Any:
+    """Return which part of each pixel the fingers cover, as `gripper_image` draws them: (..., pixels, pixels)."""
     shape = shape or GripperShape()
     xp = array_api_compat.array_namespace(state)
     device = array_api_compat.device(state)
     centers = ((xp.arange(pixels, dtype=state.dtype, device=device) + 0.5) / pixels - 0.5) * workspace.size
-    x, y, z, yaw, aperture = (state[..., i, None, None] for i in range(5))
+    x, y, _, yaw, aperture = (state[..., i, None, None] for i in range(5))
     forward = centers[:, None] - x
     sideward = centers[None, :] - y
     along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # the fingers are symmetric: |.| draws both
     across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
     resolution = workspace.size / pixels
     finger_center = (aperture * shape.opening + shape.finger) / 2
-    coverage = _ramp(xp, xp.abs(along - finger_center), shape, resolution) * _ramp(xp, across, shape, resolution)
-    return coverage * z / workspace.height_limit
+    return ramp(xp, xp.abs(along - finger_center), shape, resolution) * ramp(xp, across, shape, resolution)
 
 
 def gripper_image_uint8(
@@ -96,5 +100,6 @@ def _paint(image, rows, columns, size, pose, brightness):  # type: ignore[no-unt
             image[i, j] = np.rint(255 * min(max(inside * beside * brightness, 0.0), 1.0))
 
 
-def _ramp(xp: Any, distance: Any, shape: GripperShape, resolution: float) -> Any:
+def ramp(xp: Any, distance: Any, shape: GripperShape, resolution: float) -> Any:
+    """Return which part of a pixel, at a distance from a finger's centre along an axis, the finger covers."""
     return xp.clip((shape.finger / 2 - distance) / resolution + 0.5, 0.0, 1.0)

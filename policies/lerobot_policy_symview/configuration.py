@@ -75,8 +75,9 @@ class SymviewConfig(PreTrainedConfig):
     group: str = from_method()
     """Symmetry group of the network: `D4`, `C4`, `D8`, `C8` or, for the plain encoder, `C1`."""
     gripper_input: Literal["image", "vector", "none"] = from_method()
-    """How the gripper's pose enters: `image` draws it into a top-down view and adds its height; `vector` gives every
-    pixel x, y, z and (cos, sin) of twice the yaw; `none` leaves the paper's channels, colour, height and aperture."""
+    """How the gripper's pose enters: `image` draws it into the view or among the points and adds its height; `vector`
+    gives every pixel or point x, y, z and (cos, sin) of twice the yaw; `none` leaves the paper's channels, colour,
+    height and aperture."""
     camera_direction: bool = from_method()
     """Give every pixel the horizontal direction to the camera, which breaks the symmetry (paper 5.7)."""
     camera_rays: bool = from_method()
@@ -342,10 +343,9 @@ class SymviewConfig(PreTrainedConfig):
 
     @property
     def channels(self) -> int:
-        """Scalar channels of the network's image."""
-        return (
-            3 + (self.modality == "rgbd") + (self.gripper_input == "image") + (RAY_CHANNELS if self.camera_rays else 0)
-        )
+        """Scalar channels of the network's image, voxels or points: colour, height or occupancy, gripper, rays."""
+        has_fourth = self.modality == "rgbd" and self.encoder != "point_cloud"
+        return 3 + has_fourth + (self.gripper_input == "image") + (RAY_CHANNELS if self.camera_rays else 0)
 
     def make_view(self) -> View:
         """Return the view."""

@@ -39,15 +39,14 @@ def check_combination(config: SymviewConfig) -> None:
             f"--policy.encoder={config.encoder} has filters of single pixels, which rotations by 45 degrees do not "
             f"map onto each other: use --policy.group=D4, got {config.group}"
         )
-    if config.sees_points and (config.view.name, config.modality, config.gripper_input) != ("side", "rgbd", "vector"):
+    if config.sees_points and (config.view.name, config.modality) != ("side", "rgbd"):
         raise ValueError(
-            f"--policy.encoder={config.encoder} lifts the camera's own image: use --policy.view=side, "
-            f"--policy.modality=rgbd and --policy.gripper_input=vector, got {config.view.name}, {config.modality} and "
-            f"{config.gripper_input}"
+            f"--policy.encoder={config.encoder} lifts the camera's own image: use --policy.view=side and "
+            f"--policy.modality=rgbd, got {config.view.name} and {config.modality}"
         )
     if config.is_computed and config.modality == "rgbd" and config.height_key is None:
         raise ValueError(f"the view {config.view.name!r} has no height map: use --policy.modality=rgb")
-    if config.view.name == "side" and config.gripper_input == "image":
+    if config.view.name == "side" and config.gripper_input == "image" and not config.sees_points:
         raise ValueError(
             "--policy.gripper_input=image draws a top-down image of the gripper, which does not fit "
             "--policy.view=side: use --policy.gripper_input=vector, or --policy.method=sideview_equi for both"

@@ -8,6 +8,7 @@ EQUIVARIANT = {"encoder": "equivariant", "group": "D4", "camera_direction": Fals
 REPROJECTED = EQUIVARIANT | {"view": "reproj", "modality": "rgbd", "gripper_input": "image"}
 PERSPECTIVE = EQUIVARIANT | {"view": "persp", "modality": "rgb", "gripper_input": "image"}
 SIDEVIEW = EQUIVARIANT | {"view": "side", "modality": "rgbd", "gripper_input": "vector"}
+POINTS = SIDEVIEW | {"gripper_input": "image"}
 PLAIN = {"encoder": "plain", "group": "C1"}
 RELAXED = {"encoder": "relaxed"}
 BROKEN = {"camera_direction": True}
@@ -19,8 +20,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "oracle_equi": REPROJECTED | {"view": "top"},
     "sideview_nonequi": SIDEVIEW | PLAIN,
     "sideview_plucker": SIDEVIEW | PLAIN | {"camera_rays": True},
-    "voxel_equi": SIDEVIEW | {"encoder": "voxel"},
-    "point_cloud_equi": SIDEVIEW | {"encoder": "point_cloud"},
+    "voxel_equi": POINTS | {"encoder": "voxel"},
+    "point_cloud_equi": POINTS | {"encoder": "point_cloud"},
     "reproj_equi_relaxed": REPROJECTED | RELAXED,
     "reproj_equi_broken": REPROJECTED | BROKEN,
     "persp_equi_relaxed": PERSPECTIVE | RELAXED,

@@ -250,7 +250,7 @@ def _inference(network: nn.Module, image: Tensor, state: Tensor, dtype: str) -> 
 
 def voxel_ratio(config: PolicyBenchmark) -> float:
     """Return the training step of the voxel encoder over that with whole convolutions, for a table with blocks."""
-    encoder = VoxelEncoder(make_group("D4"), np.zeros((8, 0, 0)), config.width).to(config.device)
+    encoder = VoxelEncoder(make_group("D4"), VOXEL_CHANNELS, np.zeros((8, 0, 0)), config.width).to(config.device)
     grid = torch.zeros(VOXEL_BATCH, VOXEL_CHANNELS, HEIGHT, SIDE, SIDE, device=config.device)
     grid[:, :, 0] = grid[:, :, 1:9, 20:29, 31:40] = grid[:, :, 1:9, 40:49, 10:19] = 1.0
     state = torch.zeros(VOXEL_BATCH, 0, device=config.device)

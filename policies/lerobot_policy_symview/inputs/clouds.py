@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from lerobot_policy_symview.inputs.rays import pixel_rays
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.camera import Camera
+from lerobot_symview.geometry.gripper import GripperShape
 from lerobot_symview.geometry.workspace import Workspace
 
 POINTS = 1024  # points per scene that the point-cloud encoder gets
@@ -36,12 +38,23 @@ class Cloud:
         x, y = transform.apply(self.position[..., 0], self.position[..., 1])
         return replace(self, position=torch.stack([x, y, self.position[..., 2]], dim=-1))
 
-    def sample(self, count: int, shuffle: bool) -> Tensor:
+    def shifted(self, shift: Tensor) -> Cloud:
+        """Return the cloud of the scenes moved by (B, 2) metres along x and y."""
+        x, y = (self.position[..., :2] + shift[:, None]).unbind(-1)
+        return replace(self, position=torch.stack([x, y, self.position[..., 2]], dim=-1))
+
+    def sample(self, count: int, shuffle: bool, gripper: Tensor | None = None) -> Tensor:
         """Sample `count` valid points per scene: (B, count, 6) float32, x, y, z in metres and RGB.
 
         Without `shuffle` the sampling order is fixed for each image size. A scene with fewer valid points repeats them;
-        a scene without any gives zeros.
+        a scene without any gives zeros. With the gripper's poses (B, 5), the second and third point are
+        `gripper_points`, which have no colour, and a seventh channel is 1 for them and 0 for the others.
         """
+        if gripper is not None:  # farthest point sampling begins at the first point, and neighbours are the first ones
+            fingers = gripper_points(gripper).to(self.color.dtype)
+            points = functional.pad(self.sample(count - fingers.shape[1], shuffle), (0, 1))
+            drawn = functional.pad(functional.pad(fingers, (0, 3)), (0, 1), value=1.0)
+            return torch.cat([points[:, :1], drawn, points[:, 1:]], dim=1)
         if shuffle:
             rank = torch.rand(self.valid.shape, device=self.valid.device)
         else:
@@ -53,6 +66,23 @@ class Cloud:
         points = torch.cat([self.position.to(self.color.dtype), self.color], dim=-1)
         points = points.gather(1, chosen[..., None].expand(-1, -1, points.shape[-1]))
         return points * self.valid.any(dim=1)[:, None, None]
+
+
+def gripper_points(pose: Tensor) -> Tensor:
+    """Return the centres of the gripper's two fingers: (B, 2, 3) metres, x and y relative to the workspace centre.
+
+    More points would have distances that are equal by symmetry, and farthest point sampling would choose among them by
+    rounding.
+
+    Args:
+        pose: (B, 5), as for `gripper_image`.
+    """
+    shape = GripperShape()
+    x, y, z, yaw, aperture = pose.unbind(-1)
+    reach = (aperture * shape.opening + shape.finger) / 2
+    along = torch.stack([reach * torch.cos(yaw), reach * torch.sin(yaw), torch.zeros_like(z)], dim=-1)
+    center = torch.stack([x, y, z], dim=-1)
+    return torch.stack([center - along, center + along], dim=1)
 
 
 @torch.compiler.assume_constant_result

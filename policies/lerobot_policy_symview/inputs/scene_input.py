@@ -113,6 +113,15 @@ class SceneInput(ABC):
         state = batch[keys.STATE]
         return state if transform is None else self.config.states.transform(state, transform, absolute_yaw=True)
 
+    def _gripper(self, state: Tensor, transform: PlanarTransform | None) -> Tensor:
+        """Return the gripper's poses (B, 5); a hand without yaw turns with a transformed scene only."""
+        columns = gripper_columns(self.config.state_symmetry, self.config.gripper_turns)
+        assert columns is not None  # checked with the configuration
+        pose: Tensor = poses_from_states(state, columns)
+        if columns[POSE.index("yaw")] is None and transform is not None:
+            pose[:, POSE.index("yaw")] = transform.angle
+        return pose
+
     def _calibration(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """K (B, 9) and pose (B, 16) of the camera: the observation's, or the configuration's where it has none."""
         intrinsics, world_from_cam = keys.calibration(self.config.camera, ())
@@ -198,7 +207,8 @@ class ImageInput(SceneInput):
         if transform is not None:
             images = transform_images(images, transform)
         if self.config.gripper_input == "image":
-            images = torch.cat([images, self._gripper(state, transform, images.shape[-1])[:, None]], dim=1)
+            gripper = gripper_image(self._gripper(state, transform), self.workspace, images.shape[-1])
+            images = torch.cat([images, gripper[:, None]], dim=1)
         return crop(images, self.config.crop_size, crop_offset), state
 
     def downscale(self, images: Tensor) -> Tensor:
@@ -227,19 +237,9 @@ class ImageInput(SceneInput):
         cameras = self._lenses(batch, calibrated)
         return plucker_rays(*self._calibration(batch), calibrated, size, self.workspace, cameras)
 
-    def _gripper(self, state: Tensor, transform: PlanarTransform | None, pixels: int) -> Tensor:
-        """Draw the gripper (B, pixels, pixels); a hand without yaw turns with a transformed scene only."""
-        columns = gripper_columns(self.config.state_symmetry, self.config.gripper_turns)
-        assert columns is not None  # checked with the configuration
-        pose = poses_from_states(state, columns)
-        if columns[POSE.index("yaw")] is None and transform is not None:
-            pose[:, POSE.index("yaw")] = transform.angle
-        drawn: Tensor = gripper_image(pose, self.workspace, pixels)
-        return drawn
-
 
 class PointInput(SceneInput):
-    """The camera's RGBD image lifted to space: voxels (B, 4, Z, X, Y) or points (B, P, 6)."""
+    """The camera's RGBD image lifted to space: voxels (B, 4 or 5, Z, X, Y) or points (B, P, 6 or 7)."""
 
     @property
     def keys(self) -> list[str]:
@@ -262,7 +262,10 @@ class PointInput(SceneInput):
         *,
         shuffle: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """Return voxels (B, 4, Z, X, Y) or points (B, P, 6) and states (B, N); points are not cropped."""
+        """Return voxels (B, 4 or 5, Z, X, Y) or points (B, P, 6 or 7) and states (B, N).
+
+        A crop shifts points and the drawn gripper. It does nothing where the gripper's position is a vector.
+        """
         camera, clipping = self.config.camera, ReprojectedView()
         state, dimensions = batch[keys.STATE], self.config.state_symmetry
         z = state[:, dimensions.index("z")] if "z" in dimensions else state.new_full(state.shape[:1], torch.inf)
@@ -274,11 +277,23 @@ class PointInput(SceneInput):
             (z - clipping.clip_margin).clamp(min=clipping.clip_floor),
             self._lenses(batch, batch[keys.depth(camera)].shape[-2:]),
         )
+        state = self._state(batch, transform)
         if transform is not None:
             cloud = cloud.transformed(transform)
-        is_voxel = self.config.encoder == "voxel"
-        observation = voxelize(cloud, self.workspace) if is_voxel else cloud.sample(POINTS, shuffle=shuffle)
-        return observation, self._state(batch, transform)
+        gripper = None
+        if self.config.gripper_input == "image":
+            gripper = self._gripper(state, transform)
+            if crop_offset is not None:
+                shift = self._margin * (0.5 - crop_offset)
+                cloud, gripper[:, :2] = cloud.shifted(shift), gripper[:, :2] + shift
+        if self.config.encoder == "voxel":
+            return voxelize(cloud, self.workspace, gripper), state
+        return cloud.sample(POINTS, shuffle, gripper), state
+
+    @property
+    def _margin(self) -> float:
+        """Length in metres of what random crops cut off images."""
+        return self.workspace.size * (1 - self.config.crop_size / self.config.image_size)
 
 
 def make_scene_input(config: SymviewConfig, workspace: Workspace) -> SceneInput:

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth
-from lerobot_policy_symview.inputs.voxels import voxelize
+from lerobot_policy_symview.inputs.clouds import Cloud, cloud_from_depth, gripper_points
+from lerobot_policy_symview.inputs.voxels import gripper_voxels, voxelize
 from lerobot_policy_symview.nn.encoders.point_cloud import PointEncoder, farthest_points, neighborhoods
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
 from lerobot_symview.geometry.camera import Camera, unproject
+from lerobot_symview.geometry.gripper import GripperShape, gripper_image
 from lerobot_symview.geometry.lens import Lens
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.settings import EnvSettings
@@ -132,12 +133,53 @@ def test_farthest_points_and_neighborhoods_match_loops():
             taken.append(int(np.argmax(distances)))
         assert order.tolist() == taken
     squared = torch.cdist(points[:, :5], points).square()
-    grouped = neighborhoods(squared.topk(8, largest=False), 0.3)
+    grouped = neighborhoods(squared, 0.3, 8)
     for scene_index in range(2):
         for center in range(5):
-            within = [i for i in range(40) if squared[scene_index, center, i] <= 0.09]
-            nearest = sorted(within, key=lambda i: float(squared[scene_index, center, i]))[:8]
-            assert grouped[scene_index, center].tolist() == nearest + [center] * (8 - len(nearest))
+            within = [i for i in range(40) if squared[scene_index, center, i] <= 0.09][:8]
+            assert grouped[scene_index, center].tolist() == within + [within[0]] * (8 - len(within))
+
+
+def test_neighborhoods_fill_their_ball_where_points_are_dense():
+    """The nearest 16 points would span the same few millimetres at both radii."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([torch.zeros(1, 1, 3), torch.rand(1, 2000, 3, generator=generator) * 2 - 1], dim=1)
+    squared = points.square().sum(-1)[:, None]
+    for radius in (0.5, 1.0):
+        distances = squared[0, 0][neighborhoods(squared, radius, 16)[0, 0]].sqrt()
+        assert 0.7 * radius < distances.max() <= radius
+
+
+POSE = torch.tensor([[0.05, -0.03, 0.1, 0.4, 0.5]], dtype=torch.float64)
+
+
+def test_gripper_points_are_the_centres_of_the_fingers_of_the_gripper_image():
+    drawn = gripper_image(POSE, WORKSPACE, 800)[0].numpy()
+    row, column = np.nonzero(drawn)
+    drawn_points = (np.stack([row, column], axis=-1) + 0.5) / 800 * WORKSPACE.size - WORKSPACE.size / 2
+    axis = np.array([math.cos(0.4), math.sin(0.4)])
+    is_first = (drawn_points - POSE[0, :2].numpy()) @ axis < 0
+    for point, finger in zip(gripper_points(POSE)[0].numpy(), (is_first, ~is_first), strict=True):
+        np.testing.assert_allclose(point, [*drawn_points[finger].mean(0), 0.1], atol=2e-5)
+
+
+def test_gripper_voxels_are_cubes_around_the_gripper_points():
+    grid, edge = gripper_voxels(POSE, WORKSPACE)[0, 0], WORKSPACE.size / 64
+    assert grid.sum() * edge**3 == pytest.approx(2 * GripperShape().finger ** 3, rel=0.01)
+    points = gripper_points(POSE)[0]
+    column, layer = torch.floor(points[:, :2] / edge + 32).long(), torch.floor(points[:, 2] / edge + 0.5).long()
+    assert (grid[layer, column[:, 0], column[:, 1]] == 1).all()
+    heights = edge * torch.arange(32)
+    assert float((grid.sum((1, 2)) * heights).sum() / grid.sum()) == pytest.approx(0.1, abs=1e-6)
+
+
+def test_the_gripper_is_among_the_sampled_points(scene):
+    cloud = make_cloud(scene)
+    points = cloud.sample(1024, False, POSE)
+    torch.testing.assert_close(points[0, 1:3, :3], gripper_points(POSE)[0].float())
+    assert points[0, :, 6].nonzero().flatten().tolist() == [1, 2]
+    others = torch.cat([points[:, :1], points[:, 3:]], dim=1)[..., :6]
+    torch.testing.assert_close(others, cloud.sample(1022, False))
 
 
 @pytest.mark.parametrize("width", [16, 64])
@@ -145,7 +187,7 @@ def test_farthest_points_and_neighborhoods_match_loops():
 def test_features_of_an_untrained_network_are_of_order_one(scene, width, seed):
     """Max pooling adds to them in every abstraction: without normalisation their root mean square is 2 to 4."""
     torch.manual_seed(seed)
-    encoder = PointEncoder(make_group("D4"), np.ones((8, 1, 1)), width)
+    encoder = PointEncoder(make_group("D4"), 3, np.ones((8, 1, 1)), width)
     with torch.no_grad():
         features = encoder(make_cloud(scene).sample(1024, shuffle=False), torch.tensor([[0.5]]))
     assert 0.5 < features.square().mean().sqrt() < 1.8

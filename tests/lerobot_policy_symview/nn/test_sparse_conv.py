@@ -69,11 +69,13 @@ def test_values_that_no_active_voxel_sees_are_ignored():
 
 def test_the_voxel_encoder_equals_its_whole_convolutions():
     torch.manual_seed(0)
-    encoder = VoxelEncoder(make_group("D4"), np.ones((8, 3, 3)), 16)
+    encoder = VoxelEncoder(make_group("D4"), 5, np.ones((8, 3, 3)), 16)
     for layer in encoder.layers:
         torch.nn.init.normal_(layer.bias)
     mask = torch.zeros(2, 1, 32, 64, 64, dtype=torch.bool)
     mask[:, :, 0] = mask[0, :, :9, 20:29, 31:40] = True
-    grid, state = torch.cat([mask, torch.rand(2, 3, 32, 64, 64) * mask], dim=1), torch.rand(2, 3)
+    gripper = torch.zeros(2, 1, 32, 64, 64)
+    gripper[:, :, 20:24, 40:44, 7:11] = 1.0
+    grid, state = torch.cat([mask, torch.rand(2, 3, 32, 64, 64) * mask, gripper], dim=1), torch.rand(2, 3)
     with torch.no_grad():
         torch.testing.assert_close(encoder(grid, state), ConvolutionalEncoder.forward(encoder, grid, state))

@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from lerobot_policy_symview.configuration import SymviewConfig
 from lerobot_policy_symview.nn.encoders.base import Encoder
+from lerobot_policy_symview.nn.encoders.convolutional import with_trivial
 from lerobot_policy_symview.nn.layers import FieldLinear
 from lerobot_policy_symview.symmetry.groups import PlanarGroup, block_diagonal
 
@@ -24,13 +25,14 @@ class PointEncoder(Encoder):
 
     Args:
         group: G elements.
+        channels: invariant channels of a point: 3 of colour, and whether it is the gripper's where it is drawn.
         state: (G, D, D), representation of the state vector, which is repeated at every point.
         width: n, output fields of the global set abstraction.
     """
 
-    def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
+    def __init__(self, group: PlanarGroup, channels: int, state: NDArray[np.float64], width: int):
         super().__init__(group, width)
-        color_and_state = block_diagonal([np.ones((group.size, 1, 1))] * 3 + [state])
+        color_and_state = with_trivial(group, channels, state)
         quarter, half = width // 4, width // 2
         self.abstractions = nn.ModuleList(
             [
@@ -42,7 +44,7 @@ class PointEncoder(Encoder):
         self.global_mlp = FieldMlp(group, 4 * width, (2 * width, 4 * width, width))
 
     def forward(self, observation: Tensor, state: Tensor) -> Tensor:
-        """Map points (B, P, 6), x, y, z in metres and RGB, and states (B, D) to features (B, G, n)."""
+        """Map points (B, P, 3 + channels), x, y, z in metres first, and states (B, D) to features (B, G, n)."""
         position = observation[..., :3] / UNIT
         features = torch.cat([observation[..., 3:], state[:, None].expand(-1, observation.shape[1], -1)], dim=-1)
         for abstraction in self.abstractions:
@@ -110,10 +112,9 @@ class SetAbstraction(nn.Module):
         """Map positions (B, P, 3) and features (B, P, channels) to those of C centres, (B, C, ...)."""
         centers = _gather(position, farthest_points(position, self.centers))
         squared = _squared_distances(centers, position)
-        nearest_first = squared.topk(self.neighbors, dim=-1, largest=False)
         pooled_scales = []
         for radius, mlp in zip(self.radii, self.scales, strict=True):
-            index = neighborhoods(nearest_first, radius / UNIT)
+            index = neighborhoods(squared, radius / UNIT, self.neighbors)
             offset = _gather(position, index) - centers[:, :, None]
             pooled = mlp(features, offset, index).amax(dim=2)
             pooled_scales.append(pooled.view(*pooled.shape[:2], self.group.size, -1))
@@ -131,18 +132,24 @@ def farthest_points(position: Tensor, count: int) -> Tensor:
     return torch.stack(chosen, dim=1)
 
 
-def neighborhoods(nearest_first: tuple[Tensor, Tensor], radius: float) -> Tensor:
-    """Return the points within `radius` of each centre (ball query); the nearest one replaces those beyond.
+def neighborhoods(squared: Tensor, radius: float, count: int) -> Tensor:
+    """Return points within `radius` of each centre (ball query): the first `count` in the order of the points.
+
+    Points are in a random order, or in that of farthest point sampling, so that the first ones fill the ball; the
+    nearest ones would be the same at all radii where points are dense.
 
     Args:
-        nearest_first: squared distances (B, C, K) in ascending order, and the indices of their points.
+        squared: (B, C, P) squared distances of P points from C centres, each of which is one of the points.
         radius: in the unit of the positions.
+        count: points per neighbourhood; where there are fewer, the first one fills the places.
 
     Returns:
-        (B, C, K) indices of points.
+        (B, C, count) indices of points.
     """
-    squared, index = nearest_first
-    return torch.where(squared <= radius**2, index, index[..., :1])
+    points = squared.shape[-1]
+    order = torch.arange(points, dtype=squared.dtype, device=squared.device)
+    first = torch.where(squared <= radius**2, order, points).topk(count, dim=-1, largest=False).values.long()
+    return torch.where(first < points, first, first[..., :1])
 
 
 def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
@@ -162,4 +169,4 @@ def _gather(values: Tensor, index: Tensor) -> Tensor:
 
 def point_cloud(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     """Return the encoder of point clouds."""
-    return PointEncoder(group, state, config.width)
+    return PointEncoder(group, config.channels, state, config.width)

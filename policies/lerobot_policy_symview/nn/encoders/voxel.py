@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lerobot_policy_symview.configuration import SymviewConfig
-from lerobot_policy_symview.inputs.voxels import VOXEL_CHANNELS
 from lerobot_policy_symview.nn.encoders.base import Encoder
 from lerobot_policy_symview.nn.encoders.convolutional import ConvolutionalEncoder, with_trivial
 from lerobot_policy_symview.nn.layers import FieldConv3d
@@ -26,13 +25,14 @@ class VoxelEncoder(ConvolutionalEncoder):
 
     Args:
         group: G elements.
+        channels: invariant channels: occupancy, 3 of colour, and the gripper where it is drawn.
         state: (G, D, D), representation of the state vector, which is repeated at every voxel.
         width: n of the corresponding image encoder; 64 gives 1.18 M parameters.
     """
 
-    def __init__(self, group: PlanarGroup, state: NDArray[np.float64], width: int):
+    def __init__(self, group: PlanarGroup, channels: int, state: NDArray[np.float64], width: int):
         fields = [width // 16, width // 8, width // 4, width // 2, width, width // 2, width // 2]
-        inputs: list[int | NDArray[np.float64]] = [with_trivial(group, VOXEL_CHANNELS, state), *fields[:-1]]
+        inputs: list[int | NDArray[np.float64]] = [with_trivial(group, channels, state), *fields[:-1]]
         paddings = [(1, 1, 1)] * 5 + [(1, 0, 0), (0, 0, 0)]
         depths = [3] * 6 + [2]
         layers = [
@@ -42,7 +42,7 @@ class VoxelEncoder(ConvolutionalEncoder):
         super().__init__(group, fields[-1], layers, [True, True, True, False, False, True, False])
 
     def forward(self, observation: Tensor, state: Tensor) -> Tensor:
-        """Map voxel grids (B, 4, Z, X, Y), whose empty voxels are zero, and states (B, D) to features (B, G, n)."""
+        """Map voxel grids (B, C, Z, X, Y), whose empty voxels are zero, and states (B, D) to features (B, G, n)."""
         if is_exporting():
             return super().forward(observation, state)
         grid = _sparse_grid(observation, state)
@@ -55,12 +55,13 @@ class VoxelEncoder(ConvolutionalEncoder):
 def _sparse_grid(observation: Tensor, state: Tensor) -> SparseGrid:
     batch, channels, *sizes = observation.shape
     side = 3 * 2**SPARSE_LAYERS
+    active = (observation != 0).any(dim=1, keepdim=True).to(observation.dtype)
     state_channels = state[:, None, None, None]
     values = [observation.movedim(1, -1), state_channels.expand(-1, *sizes, -1)]
     empty = [observation.new_zeros(batch, side, side, side, channels), state_channels.expand(-1, side, side, side, -1)]
-    return SparseGrid(torch.cat(values, dim=-1), observation[:, :1], torch.cat(empty, dim=-1).movedim(-1, 1))
+    return SparseGrid(torch.cat(values, dim=-1), active, torch.cat(empty, dim=-1).movedim(-1, 1))
 
 
 def voxel(config: SymviewConfig, group: PlanarGroup, state: NDArray[np.float64]) -> Encoder:
     """Return the encoder of voxel grids."""
-    return VoxelEncoder(group, state, config.width)
+    return VoxelEncoder(group, config.channels, state, config.width)
