@@ -136,7 +136,8 @@ def _boxes(depth, v, rays, origin, overlap, height, width, boxes):  # type: igno
         left, right = _bound(x - x_half, width), _bound(x + x_half, width)
         top, bottom = _bound(y - y_half, height), _bound(y + y_half, height)
         first[u], wide[u], high[u] = top * columns + left, right - left, bottom - top
-        is_drawn = distance > 0 and distance < np.inf and w > 0 and right > left and bottom > top
+        is_finite = distance < np.inf and x_half < np.inf and y_half < np.inf
+        is_drawn = distance > 0 and is_finite and w > 0 and right > left and bottom > top
         nearness[u] = w if is_drawn else np.float32(np.inf)
 
 
@@ -166,8 +167,9 @@ def _boxes_through_lens(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bound(edge, side):  # type: ignore[no-untyped-def]
-    """First pixel centre at or behind an edge, at most `side`."""
-    return np.int32(min(max(np.ceil(np.float32(edge)), np.float32(0)), np.float32(side)))
+    """First pixel centre at or behind an edge, from 0 to `side`; 0 for NaN."""
+    first = np.ceil(np.float32(edge))
+    return np.int32(min(first if first > 0 else np.float32(0), np.float32(side)))
 
 
 @njit(cache=True, nogil=True)

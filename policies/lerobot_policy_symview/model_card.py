@@ -13,6 +13,8 @@ from lerobot_policy_symview.configuration_chunks import wrist_key
 TAGS = ("robotics", "lerobot", "symview", "equivariance")
 OBSERVATIONS = {
     "side": "the image of the camera `{camera}`, unchanged",
+    "voxel": "the RGBD image of the camera `{camera}`, lifted to voxels",
+    "point_cloud": "the RGBD image of the camera `{camera}`, lifted to points",
     "top": "the image of a true top-down camera, an oracle, without the arm",
     "reproj": "a top-down view, reprojected from the RGBD image of the camera `{camera}`",
     "persp": "a top-down view of the table, warped by a homography from the RGB image of the camera `{camera}`",
@@ -52,16 +54,18 @@ def model_card(
     )
     wrist = f", the image `{wrist_key(config)}` of a camera on the gripper" if wrist_key(config) else ""
     repository = config.repo_id or "user/name"
-    observation = OBSERVATIONS.get(config.view.name, f"the view `{config.view.name}` of the camera `{{camera}}`")
+    size = "" if config.sees_points else f" ({config.modality.upper()}, {config.crop_size} pixels)"
+    seen = config.encoder if config.sees_points else config.view.name
+    observation = OBSERVATIONS.get(seen, f"the view `{config.view.name}` of the camera `{{camera}}`")
     yaw = f"yaw as the representation `{config.theta_representation}`"
     sections = [
         f"---\n{data.to_yaml()}\n---\n",
         f"# {repository.split('/')[-1]}\n",
         f"A `{config.type}` policy of lerobot_symview, a LeRobot plugin; method `{config.method}`.\n",
         "## Inputs and outputs\n",
-        f"The observation is {observation.format(camera=config.camera)} ({config.modality.upper()}, "
-        f"{config.crop_size} pixels){wrist}, and the state. The network ({config.encoder} encoder, group "
-        f"{config.group}, width {config.width}, {parameters:,} parameters) is " + f"{_symmetry(config)}.\n",
+        f"The observation is {observation.format(camera=config.camera)}{size}{wrist}, and the state. "
+        f"The network ({config.encoder} encoder, group {config.group}, width {config.width}, "
+        f"{parameters:,} parameters) is {_symmetry(config)}.\n",
         "| feature | representation of each dimension |\n|---|---|",
         f"| `observation.state` | {', '.join(config.state_symmetry)} |",
         f"| `action` | {', '.join(config.action_symmetry)}; {yaw} |\n",

@@ -13,6 +13,7 @@ from lerobot_policy_symview.configuration_symview_bc import SymviewBcConfig
 from lerobot_policy_symview.encoders import ENCODERS
 from lerobot_policy_symview.equivariance import example_observation
 from lerobot_policy_symview.methods import METHODS
+from lerobot_policy_symview.model_card import model_card
 from lerobot_policy_symview.modeling_symview_bc import SymviewBcPolicy
 from lerobot_policy_symview.processor_symview_bc import make_symview_bc_pre_post_processors
 from lerobot_symview import keys
@@ -113,6 +114,20 @@ def test_an_action_that_is_not_finite_is_reported_with_its_cause(spoilt, message
     for act in (policy.select_action, policy.predict_action_chunk):
         with pytest.raises(DivergenceError, match=message):
             act(batch)
+
+
+def test_the_model_card_of_a_policy_on_points_names_no_size_of_an_image():
+    card = str(model_card(make_config(method="point_cloud_equi"), 1000, "me/data", {}))
+    assert "The observation is the RGBD image of the camera `side`, lifted to points, and the state." in card
+
+
+@pytest.mark.parametrize("method", ["reproj_equi", "voxel_equi", "point_cloud_equi"])
+def test_a_gripper_that_is_nowhere_is_reported(method):
+    policy = make_policy(method=method)
+    batch = example_observation(policy.config)
+    batch[keys.STATE][0, 0] = torch.nan
+    with pytest.raises(DivergenceError, match=r"observation\.state\) is not finite"):
+        policy.select_action(batch)
 
 
 @pytest.mark.long

@@ -264,7 +264,7 @@ class PointInput(SceneInput):
     ) -> tuple[Tensor, Tensor]:
         """Return voxels (B, 4 or 5, Z, X, Y) or points (B, P, 6 or 7) and states (B, N).
 
-        A crop shifts points and the drawn gripper. It does nothing where the gripper's position is a vector.
+        A crop shifts points together with the drawn gripper; it does nothing where the gripper is not drawn.
         """
         camera, clipping = self.config.camera, ReprojectedView()
         state, dimensions = batch[keys.STATE], self.config.state_symmetry

@@ -18,12 +18,12 @@ def gripper_voxels(pose: Tensor, workspace: Workspace) -> Tensor:
     """Return which part of each voxel the gripper's fingers cover: (B, 1, 32, 64, 64), of the dtype of the poses.
 
     Args:
-        pose: (B, 5), as for `gripper_image`; a finger is a cube around the gripper's height.
+        pose: (B, 5), as for `gripper_image`; a finger is a cube around the gripper's height, or at the top of the grid.
         workspace: the working volume.
     """
     edge, shape = workspace.size / SIDE, GripperShape()
     heights = edge * torch.arange(HEIGHT, dtype=pose.dtype, device=pose.device)
-    layers = ramp(torch, (heights - pose[:, 2:3]).abs(), shape, edge)
+    layers = ramp(torch, (heights - pose[:, 2:3].clamp(max=HEIGHT * edge)).abs(), shape, edge)
     coverage: Tensor = gripper_coverage(pose, workspace, SIDE, shape)
     return (layers[:, :, None, None] * coverage[:, None])[:, None]
 

@@ -11,12 +11,14 @@ from lerobot_policy_symview.inputs.voxels import gripper_voxels, voxelize
 from lerobot_policy_symview.nn.encoders.point_cloud import PointEncoder, farthest_points, neighborhoods
 from lerobot_policy_symview.symmetry.groups import make_group
 from lerobot_policy_symview.symmetry.transforms import PlanarTransform
+from lerobot_symview import keys
 from lerobot_symview.geometry.camera import Camera, unproject
 from lerobot_symview.geometry.gripper import GripperShape, gripper_image
 from lerobot_symview.geometry.lens import Lens
 from lerobot_symview.geometry.workspace import Workspace
 from symview_sim.settings import EnvSettings
 from tests.helpers.cameras import make_camera
+from tests.helpers.policies import example_observation, make_policy
 
 WORKSPACE = Workspace()
 
@@ -180,6 +182,53 @@ def test_the_gripper_is_among_the_sampled_points(scene):
     assert points[0, :, 6].nonzero().flatten().tolist() == [1, 2]
     others = torch.cat([points[:, :1], points[:, 3:]], dim=1)[..., :6]
     torch.testing.assert_close(others, cloud.sample(1022, False))
+
+
+@pytest.mark.parametrize("height", [0.02, 0.2, 0.25])
+def test_the_gripper_is_drawn_at_every_height(height):
+    pose = POSE.clone()
+    pose[0, 2] = height
+    assert gripper_voxels(pose, WORKSPACE).sum() > 0.3 * gripper_voxels(POSE, WORKSPACE).sum()
+
+
+@pytest.mark.parametrize("method", ["voxel_equi", "point_cloud_equi"])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, 0.999), (0.999, 0.3)])
+def test_crops_shift_scene_and_gripper_as_they_shift_images(method, offset):
+    image_policy, policy = make_policy(method="reproj_equi"), make_policy(method=method)
+    batch, images = example_observation(policy.config), example_observation(image_policy.config)
+    images[keys.STATE] = batch[keys.STATE]
+    offsets = torch.tensor([offset]).expand(len(batch[keys.STATE]), 2)
+    drawn = image_policy.scene.form(images, None, offsets)[0][:, -1]
+    pixel = WORKSPACE.size / image_policy.config.image_size
+    still, moved = (policy.scene.form(batch, None, crop)[0] for crop in (None, offsets))
+    torch.testing.assert_close(gripper_center(moved), center(drawn, pixel), atol=pixel, rtol=0)
+    shift = gripper_center(moved) - gripper_center(still)
+    assert shift.abs().max() > 0.01
+    if method == "point_cloud_equi":
+        expected = still[..., :2] + shift[:, None]
+        torch.testing.assert_close(moved[..., :2], expected, atol=1e-6, rtol=0)
+
+
+def test_crops_do_not_shift_points_without_the_gripper():
+    policy = make_policy(method="point_cloud_equi", gripper_input="vector")
+    batch = example_observation(policy.config)
+    offsets = torch.zeros(len(batch[keys.STATE]), 2)
+    for still, cropped in zip(policy.scene.form(batch), policy.scene.form(batch, None, offsets), strict=True):
+        assert torch.equal(still, cropped)
+
+
+def center(image, pixel):
+    """Return the mean position (B, 2), metres, of an image (B, P, P) of weights around the workspace's centre."""
+    places = (torch.arange(image.shape[-1]) + 0.5 - image.shape[-1] / 2) * pixel
+    weights = image / image.sum((1, 2), keepdim=True)
+    return torch.stack([weights.sum(2) @ places, weights.sum(1) @ places], dim=-1)
+
+
+def gripper_center(observation):
+    """Return the mean position (B, 2) of the gripper's voxels or points."""
+    if observation.ndim == 5:
+        return center(observation[:, 4].sum(1), WORKSPACE.size / 64)
+    return observation[:, 1:3, :2].mean(1)
 
 
 @pytest.mark.parametrize("width", [16, 64])

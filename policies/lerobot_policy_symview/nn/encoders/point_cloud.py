@@ -149,7 +149,7 @@ def neighborhoods(squared: Tensor, radius: float, count: int) -> Tensor:
     points = squared.shape[-1]
     order = torch.arange(points, dtype=squared.dtype, device=squared.device)
     first = torch.where(squared <= radius**2, order, points).topk(count, dim=-1, largest=False).values.long()
-    return torch.where(first < points, first, first[..., :1])
+    return torch.where(first < points, first, first[..., :1].clamp(max=points - 1))  # none is near if all are NaN
 
 
 def _squared_distances(a: Tensor, b: Tensor) -> Tensor:
