@@ -26,6 +26,10 @@ class GripperShape:
     opening: float = 0.08
     finger: float = 0.024
 
+    def reach(self, aperture: Any) -> Any:
+        """Return the distance of the fingers' centres from the gripper's, metres, at an aperture in [0, 1]."""
+        return (aperture * self.opening + self.finger) / 2
+
 
 def gripper_image(state: Any, workspace: Workspace, pixels: int, shape: GripperShape | None = None) -> Any:
     """Draw the gripper of each state as a top-down image.
@@ -57,8 +61,7 @@ def gripper_coverage(state: Any, workspace: Workspace, pixels: int, shape: Gripp
     along = xp.abs(forward * xp.cos(yaw) + sideward * xp.sin(yaw))  # the fingers are symmetric: |.| draws both
     across = xp.abs(sideward * xp.cos(yaw) - forward * xp.sin(yaw))
     resolution = workspace.size / pixels
-    finger_center = (aperture * shape.opening + shape.finger) / 2
-    return ramp(xp, xp.abs(along - finger_center), shape, resolution) * ramp(xp, across, shape, resolution)
+    return ramp(xp, xp.abs(along - shape.reach(aperture)), shape, resolution) * ramp(xp, across, shape, resolution)
 
 
 def gripper_image_uint8(
@@ -77,8 +80,7 @@ def gripper_image_uint8(
         first, last = (center - reach) / resolution + pixels / 2, (center + reach) / resolution + pixels / 2
         spans.append((max(math.floor(first), 0), min(math.ceil(last), pixels)))
     image = np.zeros((pixels, pixels), dtype=np.uint8)
-    finger_center = (aperture * shape.opening + shape.finger) / 2
-    pose = (x, y, math.cos(yaw), math.sin(yaw), finger_center, shape.finger / 2)
+    pose = (x, y, math.cos(yaw), math.sin(yaw), shape.reach(aperture), shape.finger / 2)
     _paint(image, spans[0], spans[1], workspace.size, pose, z / workspace.height_limit)
     return image
 

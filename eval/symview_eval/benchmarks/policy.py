@@ -249,10 +249,13 @@ def _inference(network: nn.Module, image: Tensor, state: Tensor, dtype: str) -> 
 
 
 def voxel_ratio(config: PolicyBenchmark) -> float:
-    """Return the training step of the voxel encoder over that with whole convolutions, for a table with blocks."""
-    encoder = VoxelEncoder(make_group("D4"), VOXEL_CHANNELS, np.zeros((8, 0, 0)), config.width).to(config.device)
-    grid = torch.zeros(VOXEL_BATCH, VOXEL_CHANNELS, HEIGHT, SIDE, SIDE, device=config.device)
-    grid[:, :, 0] = grid[:, :, 1:9, 20:29, 31:40] = grid[:, :, 1:9, 40:49, 10:19] = 1.0
+    """Return the training step of the voxel encoder over that with whole convolutions, for blocks and a gripper."""
+    channels = VOXEL_CHANNELS + 1  # the gripper
+    encoder = VoxelEncoder(make_group("D4"), channels, np.zeros((8, 0, 0)), config.width).to(config.device)
+    grid = torch.zeros(VOXEL_BATCH, channels, HEIGHT, SIDE, SIDE, device=config.device)
+    scene, gripper = grid[:, :VOXEL_CHANNELS], grid[:, VOXEL_CHANNELS]
+    scene[:, :, 0] = scene[:, :, 1:9, 20:29, 31:40] = scene[:, :, 1:9, 40:49, 10:19] = 1.0
+    gripper[:, 18:22, 20:24, 30:34] = gripper[:, 18:22, 20:24, 44:48] = 1.0
     state = torch.zeros(VOXEL_BATCH, 0, device=config.device)
     networks = {"sparse": encoder, "whole": WholeConvolutions(encoder)}
     calls = {name: _training_step(network, grid, state, config.dtype) for name, network in networks.items()}

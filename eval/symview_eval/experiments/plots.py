@@ -162,7 +162,7 @@ def _curves(entries: Sequence[TableEntry]) -> Figure:
         "label": "standard deviation of the seeds",
     }
     styles: list[dict[str, Any]] = [{"marker": ".", "color": color, "label": label} for label, color in colors.items()]
-    _legend(figure, [*styles, band])
+    _legend(figure, [*styles, band] if any(len(entry.results) > 1 for entry in entries) else styles)
     return figure
 
 

@@ -77,9 +77,8 @@ def gripper_points(pose: Tensor) -> Tensor:
     Args:
         pose: (B, 5), as for `gripper_image`.
     """
-    shape = GripperShape()
     x, y, z, yaw, aperture = pose.unbind(-1)
-    reach = (aperture * shape.opening + shape.finger) / 2
+    reach = GripperShape().reach(aperture)
     along = torch.stack([reach * torch.cos(yaw), reach * torch.sin(yaw), torch.zeros_like(z)], dim=-1)
     center = torch.stack([x, y, z], dim=-1)
     return torch.stack([center - along, center + along], dim=1)

@@ -149,6 +149,13 @@ def test_learning_curves_end_with_the_shortest_seed(tmp_path):
     assert legend(figure) == ["Reproj. Equi", "standard deviation of the seeds"]
 
 
+def test_a_learning_curve_of_one_seed_has_no_band(tmp_path):
+    figure5 = EXPERIMENTS["figure5"]
+    (cell,) = select(figure5, SCALE, ["block_picking"], ["reproj_equi"], (), [0])
+    write_result(tmp_path / cell.path, result(cell.configuration_hash, [1, 2, 3], 0))
+    assert legend(plot(figure5, "laptop", table_entries(figure5, "laptop", tmp_path))) == ["Reproj. Equi"]
+
+
 def legend(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
