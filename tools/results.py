@@ -34,9 +34,8 @@ def table(experiments: Sequence[str], demonstrations: int, results: Path) -> str
             return placement_table(experiment, results)
         for entry in table_entries(experiment, SCALE, results):
             if entry.demonstrations == demonstrations:
-                label = f"{entry.row.label}{' (RGB)' if experiment.name == 'table2' else ''}"
-                rows.setdefault(label, {})[entry.task.replace("_", " ")] = cell(entry)
-                seeds.setdefault(label, set()).add(len(entry.results))
+                rows.setdefault(entry.row.label, {})[entry.task.replace("_", " ")] = cell(entry)
+                seeds.setdefault(entry.row.label, set()).add(len(entry.results))
     for label, row in rows.items():
         row["seeds"] = " to ".join(str(count) for count in sorted({min(seeds[label]), max(seeds[label])}))
     return markdown(rows)

@@ -134,9 +134,8 @@ def _elevations(entries: Sequence[TableEntry]) -> Figure:
 
 
 def _series(entry: TableEntry) -> str:
-    """Return the method and modality of a row of figure 7."""
-    modality = "RGB" if entry.row.policy.get("modality") == "rgb" or "persp" in entry.row.name else "RGBD"
-    return f"{entry.row.label.split(',')[0]} ({modality})"
+    """Return the label of a row of figure 7 without its elevation."""
+    return entry.row.label.split(",")[0]
 
 
 def _curves(entries: Sequence[TableEntry]) -> Figure:

@@ -52,7 +52,7 @@ def method_row(name: str, label: str, method: str | None = None, **policy: Any) 
 
 
 def _rgb(method: str, label: str) -> MethodRow:
-    return method_row(f"{method}_rgb", label, method, modality="rgb")
+    return method_row(f"{method}_rgb", f"{label} (RGB)", method, modality="rgb")
 
 
 ORACLE, ORACLE_RGB = method_row("oracle_equi", "Oracle Equi"), _rgb("oracle_equi", "Oracle Equi")

@@ -61,6 +61,12 @@ def test_result_paths_are_unique(name):
     assert len({cell.path for cell in chosen}) == len(chosen)
 
 
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_tables_tell_the_rows_apart(name):
+    rows = EXPERIMENTS[name].rows
+    assert len({row.label for row in rows}) == len(rows)
+
+
 OWN_ROWS = {"reproj_equi_occlusion", "reproj_equi_splat"}  # in a table of the paper's, but not in the paper
 
 

@@ -170,7 +170,7 @@ def legend(figure):
             ["last five checkpoints, mean and 95 % interval", "best checkpoint", "paper, best checkpoint"],
         ),
         ("hidden", [10], ["mean and 95 % interval"]),
-        ("figure7", [10], ["Oracle Equi (RGBD)", "Oracle Equi (RGB)"]),
+        ("figure7", [10], ["Oracle Equi", "Oracle Equi (RGB)"]),
     ],
 )
 def test_a_legend_names_what_is_drawn(experiment, successes, shown, tmp_path):
