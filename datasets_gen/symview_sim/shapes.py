@@ -8,9 +8,10 @@ import numpy as np
 
 Vector = tuple[float, float, float]
 WALL = 0.006  # metres
-# Metres from the cabinet's origin to the centre of the handle bar of the closed drawer. The bar is 6.5 cm in front of
-# the drawer, because the hand is 6 cm thick.
-HANDLE_REACH = 0.170
+HANDLE_REACH = 0.152  # metres from the cabinet's origin to the centre of the handle bar of the closed drawer
+# Metres. The Panda's hand is 20 cm wide and ends 3.5 cm above the point between its fingertips. At a lower bar it hits
+# the cabinet as soon as its yaw is wrong.
+HANDLE_HEIGHT = 0.088
 BOWL_WALLS = 12  # PyBullet crashes at more than 16 parts
 
 
@@ -68,7 +69,7 @@ def drawer_parts(side: float = 0.2, height: float = 0.088) -> list[Part]:
         Part((WALL, side, height), (front + side - WALL / 2, 0.0, middle)),
         Part((side, WALL, height), (center, (side - WALL) / 2, middle)),
         Part((side, WALL, height), (center, -(side - WALL) / 2, middle)),
-        Part((bar, 0.1, bar), (-HANDLE_REACH, 0.0, middle)),
-        Part((-post, 0.01, 0.01), (front + post / 2, 0.045, middle)),
-        Part((-post, 0.01, 0.01), (front + post / 2, -0.045, middle)),
+        Part((bar, 0.1, bar), (-HANDLE_REACH, 0.0, HANDLE_HEIGHT)),
+        Part((-post, 0.01, 0.01), (front + post / 2, 0.045, HANDLE_HEIGHT)),
+        Part((-post, 0.01, 0.01), (front + post / 2, -0.045, HANDLE_HEIGHT)),
     ]

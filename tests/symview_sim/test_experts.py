@@ -1,3 +1,5 @@
+from itertools import chain
+
 import numpy as np
 import pytest
 
@@ -6,6 +8,8 @@ from symview_sim import TASK_NAMES
 from symview_sim.control import CONTROLS, FINE
 from symview_sim.robots import ROBOTS
 from symview_sim.settings import EnvSettings
+from symview_sim.shapes import HANDLE_REACH
+from symview_sim.tasks.drawer_opening import BEHIND, HEIGHT
 from tests.helpers.scenes import TransformedScene
 
 TINY = CameraSpec(height=8, width=8)
@@ -34,6 +38,26 @@ def test_experts_are_equivariant_to_rotations_and_reflections(task, reflect, con
             _, _, terminated, truncated, _ = env.step(env.expert_action())
             done = terminated or truncated
     assert compared > 50
+
+
+@pytest.mark.parametrize("yaw_error_deg", [0, 30, 60, 90])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_only_fingers_touch_the_cabinet_whatever_the_yaw(robot, yaw_error_deg):
+    env = EnvSettings("drawer_opening", robot=robot, camera=TINY).make()
+    touched = set()
+    for seed in range(4):
+        env.reset(seed=seed)
+        client, arm = env.scene.client, env.scene.arm
+        cabinet = client.getBodyUniqueId(client.getNumBodies() - 1)
+        position, yaw = env.scene.pose(cabinet)
+        inward = np.array([np.cos(yaw), np.sin(yaw)])
+        behind = position[:2] - (HANDLE_REACH - BEHIND) * inward
+        for place, height in ((behind, HEIGHT + 0.1), (behind, HEIGHT), (behind - 0.1 * inward, HEIGHT)):
+            arm.move([*place, height], yaw + np.pi / 2 + np.deg2rad(yaw_error_deg), 0.0)
+            touched |= {contact[3] for contact in client.getContactPoints(arm.body, cabinet)}
+    env.close()
+    assert touched
+    assert touched <= set(chain(*ROBOTS[robot].finger_links))
 
 
 @pytest.mark.long

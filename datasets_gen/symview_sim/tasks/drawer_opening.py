@@ -13,9 +13,9 @@ from symview_sim.tasks.base import Task
 
 OPENED = 0.15  # metres
 TRAVEL = 0.2  # metres: the drawer's end stop
-BEHIND = 0.028  # metres behind the bar's centre, where the fingers descend: the middle of the gap
+BEHIND = 0.027  # metres behind the bar's centre, where the fingers descend: the middle of the gap
 PULL, PULL_SPEED = 0.2, 0.16  # metres, and metres per second
-HEIGHT = 0.034
+HEIGHT = 0.078  # metres: the fingers reach below the bar, and the hand passes over the cabinet
 ASIDE = 0.02  # metres from the middle of the bar, where a person hooks it
 
 
