@@ -17,7 +17,6 @@ from lerobot_symview import keys
 from lerobot_symview.views.tracing import is_exporting
 
 HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
-EPSILON = 1e-6  # keeps the logarithm finite where tanh saturates and 1 - action ** 2 is 0
 
 
 class SymviewSacfdPolicy(SymviewPolicy):
@@ -77,8 +76,8 @@ class SymviewSacfdPolicy(SymviewPolicy):
         """
         mean, log_std = self.network(observation, state)
         noise = torch.randn_like(mean)
-        action = torch.tanh(mean + log_std.exp() * noise)
-        return action, log_prob_of(action, noise, log_std)
+        unsquashed = mean + log_std.exp() * noise
+        return torch.tanh(unsquashed), log_prob_of(unsquashed, noise, log_std)
 
     def _training_input(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return `network_input` and scaled actions (B, A), randomly transformed and cropped in training mode."""
@@ -90,7 +89,12 @@ class SymviewSacfdPolicy(SymviewPolicy):
         return *self.network_input(batch, transform, crop_offset), self.scaled(action)
 
 
-def log_prob_of(action: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
-    """Return log pi (B,) of actions tanh(mean + std noise), all (B, A) (Haarnoja et al., 2018, appendix C)."""
+def log_prob_of(unsquashed: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
+    """Return log pi (B,) of actions tanh(x) at x = mean + std noise, all (B, A) (Haarnoja et al., 2018, appendix C).
+
+    The usual log(1 - tanh(x)^2 + 1e-6) has no gradient where tanh saturates: there, a growing standard deviation raises
+    the entropy at no cost, and the mean has no way back. This form equals log(1 - tanh(x)^2) for every x.
+    """
     normal = -0.5 * noise**2 - log_std - HALF_LOG_TWO_PI
-    return (normal - torch.log(1 - action**2 + EPSILON)).sum(dim=1)
+    log_slope = 2 * (math.log(2) - unsquashed - functional.softplus(-2 * unsquashed))
+    return (normal - log_slope).sum(dim=1)

@@ -37,8 +37,11 @@ def make_policy(**options: Any) -> SymviewBcPolicy:
 
 
 def make_actor(**options: Any) -> SymviewSacfdPolicy:
+    """An actor with random weights in its head too, which is zero-initialised: zeros would satisfy any symmetry."""
     torch.manual_seed(0)
-    return SymviewSacfdPolicy(make_config(SymviewSacfdConfig, **options), dataset_stats=STATS)
+    policy = SymviewSacfdPolicy(make_config(SymviewSacfdConfig, **options), dataset_stats=STATS)
+    torch.nn.init.normal_(policy.network.head.linear.weight, std=0.1)
+    return policy
 
 
 def training_batch(config: SymviewConfig, batch: int = 4) -> dict[str, torch.Tensor]:
