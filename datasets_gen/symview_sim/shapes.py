@@ -9,8 +9,8 @@ import numpy as np
 Vector = tuple[float, float, float]
 WALL = 0.006  # metres
 HANDLE_REACH = 0.152  # metres from the cabinet's origin to the centre of the handle bar of the closed drawer
-# Metres. The Panda's hand is 20 cm wide and ends 3.5 cm above the point between its fingertips. At a lower bar it hits
-# the cabinet as soon as its yaw is wrong.
+# Metres. The Panda's hand is 20 cm wide and ends 3.5 cm above the point between its fingertips: at this bar it passes
+# over the cabinet, and at a lower one it pushes against it.
 HANDLE_HEIGHT = 0.088
 BOWL_WALLS = 12  # PyBullet crashes at more than 16 parts
 

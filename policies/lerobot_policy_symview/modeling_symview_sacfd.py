@@ -92,8 +92,8 @@ class SymviewSacfdPolicy(SymviewPolicy):
 def log_prob_of(unsquashed: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
     """Return log pi (B,) of actions tanh(x) at x = mean + std noise, all (B, A) (Haarnoja et al., 2018, appendix C).
 
-    The usual log(1 - tanh(x)^2 + 1e-6) has no gradient where tanh saturates: there, a growing standard deviation raises
-    the entropy at no cost, and the mean has no way back. This form equals log(1 - tanh(x)^2) for every x.
+    The usual log(1 - tanh(x)^2 + 1e-6) is constant where tanh saturates, so that entropy does not pull the mean back.
+    This form equals log(1 - tanh(x)^2) for every x.
     """
     normal = -0.5 * noise**2 - log_std - HALF_LOG_TWO_PI
     log_slope = 2 * (math.log(2) - unsquashed - functional.softplus(-2 * unsquashed))

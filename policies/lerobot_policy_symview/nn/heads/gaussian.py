@@ -31,8 +31,8 @@ class GaussianHead(nn.Module):
         self.dimensions = representation.shape[-1]
         trivial = np.ones((len(representation), 1, 1))
         self.linear = EquivariantLinear(fields, block_diagonal([representation] + [trivial] * len(set(shared))))
-        # Otherwise a standard deviation can reach its limit within ten updates. Behaviour cloning then pushes the mean
-        # to where tanh saturates, and neither has a gradient to come back.
+        # Otherwise a standard deviation can reach its limit within ten updates. It has no gradient there, and
+        # behaviour cloning pushes the mean to where tanh saturates.
         nn.init.zeros_(self.linear.weight)
         self.register_buffer("shared", torch.tensor(shared), persistent=False)
 
